@@ -106,7 +106,7 @@ def evaluation_share(rate: float) -> float:
     job = made.members[0].job
     settings, seconds = job.settings, []
     made.write_to_agents()
-    seconds.append(timed(lambda: job.evaluator.returns(made.members[0].agent)))
+    seconds.append(timed(lambda: job.evaluator.outcome(made.members[0].agent)))
     before_last = settings.steps / settings.evaluate_every
     last = settings.final_episodes / settings.evaluation_episodes
     evaluating = (before_last + last) * float(np.median(seconds))

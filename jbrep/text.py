@@ -19,6 +19,11 @@ _NO_NUMBER = re.compile(r"-( \(\d+/\d+\))?")
 _Item = TypeVar("_Item")
 
 
+def printable(line: str) -> str:
+    """The line without characters that could control a terminal, as names of files may hold."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+
+
 class Table(NamedTuple):
     """A table to read, in a terminal, in Markdown or on a page."""
 
@@ -38,8 +43,8 @@ class Table(NamedTuple):
     def numeric(self) -> list[bool]:
         """For each column, whether all its cells are numbers, intervals or dashes."""
         return [
-            all(_NUMBER.fullmatch(cell) or _NO_NUMBER.fullmatch(cell) for cell in column)
-            for column in zip(*self.rows, strict=True)
+            all(_NUMBER.fullmatch(row[i]) or _NO_NUMBER.fullmatch(row[i]) for row in self.rows)
+            for i in range(len(self.header))
         ]
 
     def text(self, width: int | None = None) -> str:

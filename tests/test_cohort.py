@@ -260,8 +260,14 @@ def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, d
 def alone(run):
     """What stable-baselines3 makes of a run."""
     preset, seed = run.learner.hyperparameters, training_seed(run.seed)
-    how = preset.normalize, 1, preset.action_repeat
-    env = make_env(run.task, preset.num_envs, seed, run.find_encoder(), *how)
+    env = make_env(
+        run.task,
+        preset.num_envs,
+        seed,
+        run.find_encoder(),
+        normalize=preset.normalize,
+        action_repeat=preset.action_repeat,
+    )
     steps = preset.agent_steps(run.task.max_episode_steps)
     agent = make_agent(run.learner.algorithm, preset, env, run.seed, steps)
     env.seed(seed)
@@ -342,6 +348,34 @@ def test_an_environment_that_fails_ends_its_run_alone(call, steps, done, tmp_pat
     results = together(runs(260, **SAC), tmp_path, save_every=0)
     assert results[2].reason == f"the motor is broken after {steps} steps"
     assert_same(tmp_path, done, "01")
+
+
+def test_an_environment_that_fails_when_another_run_has_failed_is_its_own_runs(
+    done, tmp_path, monkeypatch
+):
+    """The lanes of those that are left are numbered anew."""
+    asked, restored = count(), AutoresetLanes.restore
+
+    def fail_once(self, state):
+        if not next(asked):
+            raise EnvironmentFailedError("the motor is broken", 1)
+        return restored(self, state)
+
+    monkeypatch.setattr(AutoresetLanes, "restore", fail_once)
+    first, second, third = runs(260, **SAC)
+    results = together([first.replace(encoder=Huge()), second, third], tmp_path)
+    assert results[0].reason == "train/critic_loss is inf after 64 steps"
+    assert results[2].reason == "the motor is broken after 64 steps"
+    assert_same(tmp_path, done, "1")
+
+
+def test_the_time_of_a_run_is_its_own(tmp_path):
+    """It doesn't begin when the run is planned, before others are trained."""
+    (run, *_) = runs(64, **SAC)
+    job = Job(run, tmp_path / "run")
+    job.history._started -= 1000
+    ((_, record),) = train_jobs([job], Session())
+    assert 0 < record.seconds < 500
 
 
 def check(run):

@@ -1,5 +1,6 @@
 """Policies as functions of observations: they act as the runs that they were taken from."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from jbrep.encoders import find
 from jbrep.envs.description import describe
 from jbrep.envs.lanes import Lanes
 from jbrep.errors import InputError
+from jbrep.play.sources import find_player
 from jbrep.rl import Run, train
 from jbrep.rl.controller import Controller, load_policy
 from jbrep.rl.normalization import Statistics
@@ -101,6 +103,27 @@ def test_units_of_the_actuators_are_those_of_the_task():
     worst, spread = difference_over_an_episode(trained, controller_of(trained), 50)
     assert worst < 4e-6
     assert spread > 1e-3
+
+
+def test_reading_a_policy_takes_little_and_leaves_random_numbers_alone():
+    """Making an agent allocates a replay buffer, and seeds what the whole process draws from."""
+    task = describe("face_direction")
+
+    def read():
+        find_player("trained", task)
+        assert Run.of(task, "sac", overrides={"batch_size": 64}).learner.hyperparameters
+
+    random = []
+    for work in (lambda: None, read):
+        np.random.seed(7)  # noqa: NPY002 - as users may
+        torch.manual_seed(7)
+        tracemalloc.start()
+        work()
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert most < 50e6
+        random.append((np.random.rand(), torch.rand(1).item()))  # noqa: NPY002
+    assert random[0] == random[1]
 
 
 def test_the_policy_of_a_folder_and_of_a_file(tmp_path):

@@ -152,7 +152,7 @@ def test_whoever_plays_the_policy_holds_its_actions(run, tmp_path):
     assert moved.action_repeat == REPEAT
     agent = sb3_class("sac").load(run / POLICY_ZIP)
     assert agent.action_repeat == REPEAT
-    returns = Evaluator(Lanes(TASK, 3), moved.encoder, 3).returns(agent)
+    returns = Evaluator(Lanes(TASK, 3), moved.encoder, 3).outcome(agent).returns
     np.testing.assert_allclose(returns, last, atol=6e-4)
 
 

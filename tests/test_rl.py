@@ -164,7 +164,7 @@ def test_evaluation_is_the_deterministic_policys_return():
         total += lanes.step(agent.predict(latent, deterministic=True)[0]).reward
     evaluator = Evaluator(Lanes(TASK, 2), encoder, 2)
     for _ in range(2):  # the same episodes each time
-        np.testing.assert_allclose(evaluator.returns(agent), total, rtol=1e-5)
+        np.testing.assert_allclose(evaluator.outcome(agent).returns, total, rtol=1e-5)
 
 
 def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path):

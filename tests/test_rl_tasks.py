@@ -108,10 +108,11 @@ def test_evaluations_are_in_the_order_of_their_starts():
     """Episodes of different lengths end in another order."""
     encoder = find("full", HOPPER)
     agent = make_agent("sac", get_preset("modern", "sac"), make_env(HOPPER, 1, 0, encoder), 0)
-    together = Evaluator(Lanes(HOPPER, 4), encoder, 4).returns(agent)
+    together = Evaluator(Lanes(HOPPER, 4), encoder, 4).outcome(agent).returns
     assert len(set(together.round(3))) == 4
     for i, expected in enumerate(together):
-        (alone,) = Evaluator(Lanes(HOPPER, 1), encoder, 1, EVALUATION_SEED + i).returns(agent)
+        evaluator = Evaluator(Lanes(HOPPER, 1), encoder, 1, EVALUATION_SEED + i)
+        (alone,) = evaluator.outcome(agent).returns
         assert alone == pytest.approx(expected, rel=1e-4)
 
 
@@ -146,7 +147,7 @@ def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
     result = train(run, tmp_path)
     assert result.status == FAILED
     where = f"failed at step 7 of the episode with seed {training_seed(0) + 3}"
-    assert result.reason.startswith(f"Test/Cart-v0 {where}: RuntimeError: the motor?[2J is")
+    assert result.reason.startswith(rf"Test/Cart-v0 {where}: RuntimeError: the motor\x1b[2J is")
     assert result.reason.endswith(" after 48 steps")  # of 8 lanes
     assert read_run(tmp_path) == result
     assert [row.step for row in read_evaluations(tmp_path)] == [0]
@@ -245,7 +246,7 @@ def test_a_run_on_a_schedule_does_not_go_on(tmp_path):
     settings = {"algorithm": "a2c", **ONE_EACH}
     settings |= {"overrides": {"learning_rate": "linear:1e-3"}}
     train(Run.of(CART, steps=80, **settings), tmp_path, Session(keep_checkpoint=True))
-    with pytest.raises(InputError, match="its learning_rate fell to 0 in them, which a longer"):
+    with pytest.raises(InputError, match="its learning_rate has fallen to 0 already, where"):
         train(Run.of(CART, steps=160, **settings), tmp_path)
 
 

@@ -23,7 +23,9 @@ from jbrep.envs.make import make_env
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError
 from jbrep.pool import Pool, WorkerError
+from jbrep.rl import Run
 from jbrep.rl.files import read_run
+from jbrep.rl.speed import estimate
 
 import_modules(["arms", "environments"])
 HOPPER = Path(gymnasium.__file__).parent / "envs/mujoco/assets/hopper.xml"
@@ -208,6 +210,14 @@ def test_features_of_a_batch_have_no_offsets():
     task = describe("face_direction").replace(offsets={"position_x": 100.0})
     with pytest.raises(InputError, match="is stepped as a batch: its features have no offsets"):
         Lanes(task, 1)
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "a2c"])
+def test_what_an_estimate_opens_is_closed(algorithm):
+    task = describe("Pendulum-v1", max_episode_steps=20)
+    run = Run.of(task, algorithm, steps=400, evaluation_episodes=1, overrides={"num_envs": 2})
+    assert estimate([run]) > 0
+    assert not instances._used
 
 
 # one robot, which fails

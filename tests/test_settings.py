@@ -60,7 +60,7 @@ def edited(folder, to, **hyperparameters):
 
 def agent_of(algorithm, overrides, preset="modern"):
     chosen = overridden(algorithm, preset, overrides)
-    env = make_env(TASK, chosen.num_envs, 0, find("full", TASK), chosen.normalize)
+    env = make_env(TASK, chosen.num_envs, 0, find("full", TASK), normalize=chosen.normalize)
     return make_agent(algorithm, chosen, env, 0)
 
 
@@ -361,7 +361,7 @@ def test_gradient_steps_and_evaluations_use_the_statistics_without_changing_them
     stored = agent.replay_buffer.observations[:20]
     batch = agent.replay_buffer._get_samples(np.arange(20), env=agent._vec_normalize_env)
     np.testing.assert_array_equal(batch.observations.numpy(), before(stored[:, 0]))
-    Evaluator(Lanes(TASK, 2), find("full", TASK), 2).returns(agent)
+    Evaluator(Lanes(TASK, 2), find("full", TASK), 2).outcome(agent)
     after = statistics_of(agent)
     assert (before.count, *before.mean) == (after.count, *after.mean)
 

@@ -157,12 +157,18 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         data=SimpleNamespace(task=FACE),
         encoders={code: {"rewarded": -finals[code]} for code in codes},
         hashes={code: f"hash of {code}" for code in codes},
-        worth=SimpleNamespace(learned={"trees": {code: finals[code] ** 2 for code in codes}}),
+        worth=SimpleNamespace(
+            learned={
+                "trees": {
+                    code: SimpleNamespace(final=SimpleNamespace(value=finals[code] ** 2))
+                    for code in codes
+                }
+            }
+        ),
     )
     monkeypatch.setattr(worth, "read_tables", lambda folder: tables)
     monkeypatch.setattr(worth, "read_document", lambda path, kind: evaluation)
     monkeypatch.setattr(worth, "headline", lambda known: known)
-    monkeypatch.setattr(worth, "shown", lambda learned: SimpleNamespace(value=learned))
     worth.main("study")
     lines = [re.split(" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
     assert lines[2] == ["ranked by", FACE, "mean", "above rewarded", "above a short run"]

@@ -26,7 +26,7 @@ from jbrep.rl import Run, Session, train
 from jbrep.rl.files import CHECKPOINT, RUN
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_file import read
-from jbrep.rl.trained import of_file, save
+from jbrep.rl.trained import of_file, pack
 
 import_modules(["environments"])
 SHORT = describe("face_direction", max_episode_steps=40)
@@ -156,7 +156,7 @@ def test_it_is_verified_repaired_and_not_derived(data, tmp_path):
 
 def test_a_policy_s_file_works_wherever_a_policy_is_named(runs, tmp_path):
     path = tmp_path / "mine.safetensors"
-    save(load_run(runs / "jb"), path, "mine")
+    path.write_bytes(pack(load_run(runs / "jb"), "mine"))
     player, of_run = find_player(str(path)), find_player(str(runs / "jb"))
     np.testing.assert_array_equal(player.returns(2), of_run.returns(2))
     assert player.representation == "dae-8"
@@ -181,7 +181,7 @@ def test_a_policy_s_file_works_wherever_a_policy_is_named(runs, tmp_path):
 )
 def test_a_policy_s_file_that_means_harm(change, message, runs, tmp_path):
     path = tmp_path / "it.safetensors"
-    save(load_run(runs / "jb"), path, "mine")
+    path.write_bytes(pack(load_run(runs / "jb"), "mine"))
     tensors, header = container.read(path, "policy")
     container.write(path, tensors, {**header, **change})
     with pytest.raises(InputError, match=message):

@@ -52,6 +52,15 @@ def test_windows_lie_within_episodes_and_have_the_data_sets_numbers(data, horizo
         np.testing.assert_allclose(windows.rewards(numbers, horizon), mean, atol=1e-6)
 
 
+def test_rows_and_actions_share_the_memory(data):
+    """Each gets its part, as both are there at once."""
+    numbers = len(data.train) * (data.size + data.task.action_size)
+    for memory, is_held in ((4 * numbers, True), (4 * numbers - 1, False)):
+        windows = Windows(data, data.train, 1, memory=memory)
+        held = [isinstance(each, torch.Tensor) for each in (windows._scaled, windows._action)]
+        assert all(held) == is_held
+
+
 def test_a_pass_in_blocks_has_the_same_windows(data, monkeypatch):
     monkeypatch.setattr("jbrep.methods.passes._BLOCK", 7)
     windows = Windows(data, data.train, 6)

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from jbrep.stats.intervals import Bounds
 from jbrep.worth import agents, fitted, offline, planning
 from jbrep.worth.fitted import Coded, Fourier, Trees
 from jbrep.worth.offline import Ground, learned
-from jbrep.worth.steps import Held, choices, stored
+from jbrep.worth.steps import Transitions, candidates, stored
 from jbrep.worth.worth import _lanes, work_out
 
 
@@ -36,13 +37,13 @@ def line(seed=0, steps=4000):
     action = random.uniform(-1, 1, (steps, 1)).astype(np.float32)
     after = np.clip(place + 0.2 * action, -1, 1)
     ones = np.ones(steps)
-    held = Held(place, action, 1 - np.abs(after[:, 0]), after, ones, ones > 0)
+    held = Transitions(place, action, 1 - np.abs(after[:, 0]), after, ones, ones > 0)
     return Coded(place, after, held)
 
 
 WAYS = {
-    "trees": lambda steps, task: fitted.q_iteration(Trees(steps), steps, 0.9, choices(task)),
-    "fourier": lambda steps, task: fitted.q_iteration(Fourier(steps), steps, 0.9, choices(task)),
+    "trees": lambda steps, task: fitted.q_iteration(Trees(steps), steps, 0.9, candidates(task)),
+    "fourier": lambda steps, task: fitted.q_iteration(Fourier(steps), steps, 0.9, candidates(task)),
     "network": lambda steps, task: planning.planned(planning.network_model(steps), 0.9, 1),
 }
 
@@ -59,9 +60,11 @@ def test_what_is_learned_goes_where_the_reward_is(way):
 def test_by_constant_rewards_ends_are_avoided_or_sought(reward, way):
     """The left end of a line: avoided where each step earns one, sought where it costs one."""
     code, after, held = line()
-    goes_on = (after[:, 0] > -1).astype(float)
+    continues = (after[:, 0] > -1).astype(float)
     reward_of_each = np.full(len(code), reward)
-    steps = Coded(code, after, Held(code, held.action, reward_of_each, after, goes_on, held.first))
+    steps = Coded(
+        code, after, Transitions(code, held.action, reward_of_each, after, continues, held.first)
+    )
     choose = WAYS[way](steps, describe("face_direction"))
     assert np.sign(choose(np.array([[-0.9], [-0.75]], np.float32))).ravel().tolist() == [reward] * 2
 
@@ -80,7 +83,7 @@ def test_fourier_features_hide_what_a_scale_hides_and_trees_do_not():
     steps = line()
     noise = np.random.default_rng(2).normal(size=(2, 4000, 1)).astype(np.float32) * 1e4
     badly = Coded(
-        np.hstack((steps.code, noise[0])), np.hstack((steps.following, noise[1])), steps.held
+        np.hstack((steps.code, noise[0])), np.hstack((steps.next_code, noise[1])), steps.held
     )
     places = np.array([[p, n] for p in (-0.8, 0.8) for n in (-9e3, 0.0, 9e3)], np.float32)
     right = {
@@ -107,7 +110,7 @@ def test_held_steps_are_means_of_control_steps(data):
     assert held.reward[3] == pytest.approx(episode["reward"][30:40].mean(dtype=np.float64))
     assert held.action[3] == pytest.approx(episode["action"][30:40].mean(axis=0), abs=1e-6)
     assert held.observation[3].tobytes() == episode["observation"][30].tobytes()
-    assert held.following[-1].tobytes() == episode.record["final_observation"].tobytes()
+    assert held.next_observation[-1].tobytes() == episode.record["final_observation"].tobytes()
     assert held.first.tolist() == [True] + 9 * [False]
 
 
@@ -168,6 +171,13 @@ def test_what_is_known_stays_and_the_rest_goes_on(data, told, tmp_path, monkeypa
     assert "isn't known yet" not in evaluation_text(there)
     assert set(work_out(there, *arguments).worth.learned) == {"trees", "fourier"}
     assert asked[2:] == [("trees", "pca-8"), ("fourier", "full"), ("fourier", "pca-8")]
+    monkeypatch.setattr("jbrep.worth.worth._lanes", lambda data: nullcontext())
+    with pytest.raises(InputError, match="returns that were played, and the environment can't be"):
+        work_out(there, encoders, data, tmp_path, ["planning"])
+    assert {*read_document(tmp_path / "evaluation.json", Evaluation).worth.learned} == {
+        "trees",
+        "fourier",
+    }
 
 
 def test_the_time_of_agents_that_were_stopped_counts(data, told, tmp_path, monkeypatch):

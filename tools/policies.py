@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from jbrep.jitterbug.tasks import TASKS
+from jbrep.records.storage import write_whole
 from jbrep.rl.files import EPISODES, FINISHED, last_returns, read_evaluations, read_run, runs_below
 from jbrep.rl.policy import load_run
 from jbrep.rl.shipped import SHIPPED, Returns, file_of, shipped, write_returns
-from jbrep.rl.trained import save
+from jbrep.rl.trained import pack
 from jbrep.stats.scale import LOOKING, STILL
 from jbrep.study.tables import REFERENCE_RETURNS, References, read_references, table_hashes
 
@@ -60,7 +61,7 @@ def main() -> None:
         if reached - least < most - reached:
             print(f"{task}: none shipped, as {run} returns about what standing still does")
             continue
-        save(load_run(run), file_of(task), SHIPPED)
+        write_whole(file_of(task), pack(load_run(run), SHIPPED))
         played[task] = {SHIPPED: np.array(learned), "heuristic": np.array(written)}
         print(f"{task}: {run}, {value:.0f} in training, at last; median {reached:.0f}")
     write_returns(played)

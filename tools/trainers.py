@@ -5,7 +5,6 @@ verdicts go by the rule in results/trainers/README.md.
 """
 
 import sys
-from collections import defaultdict
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -27,7 +26,7 @@ from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import variance_ratio
 from jbrep.stats.rules import Planned, Rules
 from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.tables import RETURNS, Return
+from jbrep.study.tables import RETURNS, Return, by_run
 from jbrep.text import rounded, table
 
 SB3, *COHORTS = ARMS = ("sb3", "float32", "bfloat16")
@@ -151,13 +150,11 @@ def read_arm(folder: Path, arm: str) -> list[RunCurve]:
     record = read_document(folder / RECORD, RunsRecord)
     if failed := [run.seed for run in record.runs if run.status != FINISHED]:
         raise InputError(f"{folder}: the runs of the seeds {failed} failed")
-    returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in read_rows(folder / RETURNS, Return):
-        returns[row.seed][row.step].append(row.episode_return)
+    rows = read_rows(folder / RETURNS, Return, record.tables[RETURNS])
     return [
         RunCurve(
-            task=row.task,
-            algorithm=row.algorithm,
+            task=rows[0].task,
+            algorithm=rows[0].algorithm,
             representation=arm,
             seed=seed,
             settings="",
@@ -167,7 +164,7 @@ def read_arm(folder: Path, arm: str) -> list[RunCurve]:
             return_floor=0,
             solved=900,
         )
-        for seed, by_step in returns.items()
+        for (_, seed), by_step in by_run(rows).items()
     ]
 
 

@@ -24,7 +24,6 @@ from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.table import headline
 from jbrep.records.document import read_document
 from jbrep.report.tables import Tables, read_tables
-from jbrep.report.worth import shown
 from jbrep.stats.association import difference, mean_rank_correlation
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.study.tables import by_run
@@ -82,7 +81,7 @@ def scores(evaluation: Evaluation) -> dict[str, Mapping[str, float]]:
     """What was known of every code before agents trained, by what found it out."""
     known = {code: headline(each)[REWARDED] or 0.0 for code, each in evaluation.encoders.items()}
     ways = evaluation.worth.learned if evaluation.worth else {}
-    found = {way: {c: shown(each).value or 0.0 for c, each in ways[way].items()} for way in ways}
+    found = {way: {c: each.final.value or 0.0 for c, each in ways[way].items()} for way in ways}
     return {REWARDED: known, **{w: each for w, each in found.items() if each.keys() >= {*known}}}
 
 

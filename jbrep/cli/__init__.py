@@ -7,14 +7,13 @@ from jbrep.cli.data import collect, data
 from jbrep.cli.encoders import encoder, evaluate
 from jbrep.cli.environment import env
 from jbrep.cli.inspect import inspect
-from jbrep.cli.output import printable
 from jbrep.cli.policies import behaviour, evaluate_policy, policies
 from jbrep.cli.policy import policy
 from jbrep.cli.render import render
 from jbrep.cli.rl import rl, tune
 from jbrep.cli.study import report, study
 from jbrep.cli.train import train_dae, train_encoder
-from jbrep.text import facts, terminal_width
+from jbrep.text import facts, printable, terminal_width
 
 
 @click.group(

@@ -14,9 +14,10 @@ from typing import Any, TypeVar
 
 import click
 
-from jbrep.cli.output import lasting_output, printable, say, tell
+from jbrep.cli.output import lasting_output, say, tell
 from jbrep.cli.signals import leave
 from jbrep.errors import InputError, Notice
+from jbrep.text import printable
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 

@@ -9,10 +9,10 @@ import click
 from jbrep.cli.base import PATH, Variadic, as_json, data_option
 from jbrep.cli.completion import complete_encoder, complete_task
 from jbrep.cli.environment import environment_options, given_task, needed_task, task_option
-from jbrep.cli.output import echo_json, echo_text, printable, say
+from jbrep.cli.output import echo_json, echo_text, say
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
-from jbrep.text import facts, r2_text, slug, table, terminal_width, wrapped
+from jbrep.text import facts, printable, r2_text, slug, table, terminal_width, wrapped
 
 if TYPE_CHECKING:
     from jbrep.encoders import Encoder

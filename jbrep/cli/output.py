@@ -11,7 +11,7 @@ from typing import Any, TextIO
 
 import click
 
-from jbrep.text import terminal_width, wrapped
+from jbrep.text import printable, terminal_width, wrapped
 
 
 @contextmanager
@@ -87,11 +87,6 @@ class _Lasting:
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self._stream.fileno())
             os.close(nowhere)
-
-
-def printable(line: str) -> str:
-    """The line without characters that could control a terminal, as names of files may hold."""
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 def say(line: str, err: bool = False) -> None:

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders.base import BaseEncoder
@@ -98,10 +99,8 @@ def _known(episode: PlayedEpisode) -> int:
 
 def returns_to_go(reward: NDArray[Any]) -> Array:
     """Discounted sums of the rewards from each step on, (n,)."""
-    values = np.zeros(len(reward) + 1)
-    for step in reversed(range(len(reward))):
-        values[step] = reward[step] + GAMMA * values[step + 1]
-    return values[:-1]
+    backwards: Array = lfilter([1], [1, -GAMMA], reward[::-1].astype(np.float64))
+    return backwards[::-1]
 
 
 def problems(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dict[str, Problem]:
@@ -109,7 +108,7 @@ def problems(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dic
 
     No values where too few episodes are left to fit to and to judge on.
     """
-    seen, taken, _ = _acting(held_out, policy, "train")
+    seen, taken, _ = held_out.once(_acting, policy, "train")
     told = {"action": Problem(encoder.encode(seen), taken)}
     if states := policy.states:
         latent = encoder.encode(states.observation)
@@ -149,8 +148,8 @@ def action(
     """R^2 of what the policy would do in held-out rows, from the latent: linear and nonlinear."""
     if policy is None:
         return None
-    seen, taken, _ = _acting(held_out, policy, "train")
-    unseen, true, rows = _acting(held_out, policy, "test")
+    seen, taken, _ = held_out.once(_acting, policy, "train")
+    unseen, true, rows = held_out.once(_acting, policy, "test")
     latent = encoder.encode(unseen)
     linear, nonlinear = ridge(encoder.encode(seen), taken)(latent), predictors["action"](latent)
     return Action(
@@ -159,7 +158,6 @@ def action(
     )
 
 
-@lru_cache(2)  # since all encoders share them
 def _acting(
     held_out: HeldOut, policy: GoodPolicy, part: str
 ) -> tuple[NDArray[np.float32], Array, Rows]:
@@ -205,7 +203,7 @@ def needs(
         return Needs(None, {})
     ahead = min(learnt.forward, key=lambda steps: abs(steps - _HORIZON))
     count = max(2, _NUMBERS // held_out.data.task.size)  # rows in which features are shuffled
-    steps = following(held_out, "test", ahead)
+    steps = held_out.once(following, "test", ahead)
     seen, told = steps.observation[:count], learnt.forward[ahead]
     inputs = steps.action[:count]
     shares = _shares(

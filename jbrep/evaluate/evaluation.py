@@ -168,6 +168,11 @@ class Learned(Record, frozen=True, kw_only=True):
     again: Score | None = None  # learned again with steps of its own beside those of the data
     seconds: float  # of CPU time
 
+    @property
+    def final(self) -> Score:
+        """The mean return that counts: with steps of its own, if there were any."""
+        return self.again or self.score
+
 
 class Worth(Record, frozen=True, kw_only=True):
     """What codes are worth to ways of learning, as far as is known; see docs/worth.md."""

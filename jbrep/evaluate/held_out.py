@@ -1,9 +1,9 @@
 """The held-out episodes that encoders are judged on, and R^2 with intervals over episodes."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from jbrep.evaluate.truth import Columns, every
 from jbrep.stats.bootstrap import Array, bootstrap, by_episode, r_squared, variation
 
 Rows = NDArray[np.int64]
+_T = TypeVar("_T")
 
 MAX_GROUPS = 1000  # of episodes, to resample
 MAX_NUMBERS = 1 << 23  # in an array of sampled rows: 64 MiB
@@ -52,6 +53,14 @@ class HeldOut:
         self._ends = np.cumsum(data.dataset.episodes["length"], dtype=np.int64)
         self.numbers = np.unique(self._episode(data.test))
         self.num_groups = min(len(self.numbers), MAX_GROUPS)
+        self._found: dict[tuple[Any, ...], Any] = {}
+
+    def once(self, compute: Callable[..., _T], *given: Any) -> _T:
+        """What a function makes of this and of what else is given, computed for the first only."""
+        if (compute, *given) not in self._found:
+            self._found[compute, *given] = compute(self, *given)
+        found: _T = self._found[compute, *given]
+        return found
 
     def __len__(self) -> int:
         return len(self.numbers)

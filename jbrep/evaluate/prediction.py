@@ -1,7 +1,6 @@
 """Controlled forward prediction: what a code and the next actions say of what comes next."""
 
 from collections.abc import Mapping
-from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -70,7 +69,7 @@ def prediction(
     means = [np.append(each, 0.0) for each in (np.ones(len(names)), matters) if each is not None]
     results = {}
     for ahead, predictor in predictors.items():
-        steps = following(held_out, "test", ahead)
+        steps = held_out.once(following, "test", ahead)
         each = explained(
             predictor(steps.inputs(encoder)),
             steps.wanted,
@@ -95,7 +94,7 @@ def problems(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, tuple[Problem
     """
     told = {}
     for ahead in usual_horizons(held_out.data):
-        steps = following(held_out, "train", ahead)
+        steps = held_out.once(following, "train", ahead)
         inputs, (changed, reward) = steps.inputs(encoder), np.split(steps.wanted, [-1], axis=1)
         told[ahead] = Problem(inputs, changed, share=_SHARE), Problem(inputs, reward)
     return told
@@ -108,7 +107,6 @@ def usual_horizons(data: ScaledDataset) -> list[int]:
     return [h for h in HORIZONS if all((after >= h).mean() >= _USUAL for after in later)]
 
 
-@lru_cache(2 * len(HORIZONS))  # since all encoders share them
 def following(held_out: HeldOut, part: str, ahead: int) -> Steps:
     """A sample of the rows of `train` or `test` that have so many rows after them."""
     data = held_out.data

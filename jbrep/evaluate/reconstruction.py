@@ -1,7 +1,6 @@
 """What an encoder and its decoder lose, from clean and from corrupted observations."""
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +48,7 @@ def reconstruction(encoder: BaseEncoder, held_out: HeldOut) -> Reconstruction:
     """
     losses = _losses(encoder, held_out, held_out.data.test)
     quantiles = np.quantile(losses.by_row, _QUANTILES).tolist()
-    ours, pca = losses.sums, _pca(held_out, encoder.latent_size)
+    ours, pca = losses.sums, held_out.once(_pca, encoder.latent_size)
     decoded = [name not in encoder.not_decoded for name in held_out.data.task.feature_names]
     over_decoded = _means(ours[:, decoded]), _means(pca[:, decoded])
     is_smaller = encoder.latent_size < held_out.data.task.size
@@ -74,7 +73,7 @@ def corruption(encoder: BaseEncoder, held_out: HeldOut) -> tuple[Corruption, ...
     levels = []
     for noise in NOISES:
         ours = _means(_losses(encoder, held_out, rows, noise).sums)
-        best = _best_linear(held_out, encoder.latent_size, noise)
+        best = held_out.once(_best_linear, encoder.latent_size, noise)
         levels.append(
             Corruption(
                 noise=noise,
@@ -120,7 +119,6 @@ def _errors(
         yield np.square(lost(encoder, observation, data, observation + noise * drawn * width))
 
 
-@lru_cache(1024)  # since encoders of one size share it
 def _best_linear(held_out: HeldOut, latent: int, noise: float) -> Array:
     """The sums over each group of the best linear denoiser's errors, (groups, 1)."""
     data = held_out.data
@@ -128,7 +126,6 @@ def _best_linear(held_out: HeldOut, latent: int, noise: float) -> Array:
     return _means(_losses(linear, held_out, sample(data.test, _CORRUPTED_ROWS), noise).sums)
 
 
-@lru_cache(1024)
 def _pca(held_out: HeldOut, latent: int) -> Array:
     """The sums over each group of PCA's errors, of each feature, (groups, d)."""
     data = held_out.data

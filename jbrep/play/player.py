@@ -105,8 +105,10 @@ class Player(NamedTuple):
         Raises:
             InputError: more episodes than an evaluation may have.
         """
-        for some in _batches(count, max(1, _BATCH_BYTES // self._episode_bytes)):
-            yield from self.play(some, target_yaw)
+        check_episodes(count)
+        most = max(1, _BATCH_BYTES // self._episode_bytes)
+        for first in range(0, count, most):
+            yield from self.play(range(first, min(first + most, count)), target_yaw)
 
     def returns(self, count: int, threads: int | None = None, retries: int = 0) -> Array:
         """Returns of the first `count` of these episodes, (count,).
@@ -179,10 +181,3 @@ def check_episodes(count: int) -> None:
     """
     if count > MAX_EPISODES:
         raise InputError(f"{count:,} episodes are too many: at most {MAX_EPISODES:,} are played")
-
-
-def _batches(count: int, most: int) -> Iterator[range]:
-    """The first episodes of evaluation, at most so many at a time."""
-    check_episodes(count)
-    for start in range(0, count, most):
-        yield range(start, min(start + most, count))

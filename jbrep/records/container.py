@@ -92,18 +92,20 @@ def unpack(raw: bytes, path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
     return tensors, header
 
 
-def format_of(path: Path) -> str:
-    """The format that the header of such a file names; empty for any other file."""
+def peek(path: Path) -> dict[str, Any]:
+    """The header of such a file, by no checksum; empty for any other file."""
     try:
         file = open_regular(path)
         if file is None:
-            return ""
+            return {}
         with file:
             start = file.read(8)
             start += file.read(min(int.from_bytes(start, "little"), MAX_BYTES))
-        return str(_header(start).get("format", ""))
+        header = _header(start)
+        header.pop(_CHECKSUM, None)
+        return header
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return ""
+        return {}
 
 
 def _header(raw: bytes) -> dict[str, Any]:

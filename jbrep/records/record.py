@@ -19,6 +19,7 @@ from msgspec.structs import force_setattr
 
 from jbrep.errors import InputError
 from jbrep.records.words import at, bare, must_be, type_of
+from jbrep.text import printable
 
 _Kind = TypeVar("_Kind")
 
@@ -153,7 +154,7 @@ def _inside(name: str, field: str) -> str:
 def shown(value: Any) -> str:
     """A value in a message: short, on one line, and with nothing that controls a terminal."""
     text = value if isinstance(value, str) else ascii(_plain_or_text(value))
-    text = "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
+    text = printable(text)
     text = text if len(text) <= _MOST_SHOWN else f"{text[: _MOST_SHOWN - 3]}..."
     return repr(text) if isinstance(value, str) else text
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 from jbrep.report.returns import by_task, named, shown_return
 from jbrep.report.tables import Tables
-from jbrep.report.words import listed, over
+from jbrep.report.words import enumerated, over
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.arms import FEWEST_UNITS
 from jbrep.stats.claims import CONTRADICTED, EXPLORATORY, NOT_YET, SUPPORTED, UNDECIDED, Verdict
@@ -97,7 +97,7 @@ def _conclusion(analysis: Analysis) -> Iterable[str]:
     silent = [group for group in compared if group.labels[0].learnt != YES]
     if silent:
         surely = "" if all(group.labels[0].learnt == NO for group in silent) else "clearly "
-        where = f" on {listed([group.name for group in silent])}" if len(compared) > 1 else ""
+        where = f" on {enumerated([group.name for group in silent])}" if len(compared) > 1 else ""
         what = "but what was registered " if any(group.is_judged for group in silent) else ""
         yield (
             f"Agents on {analysis.baseline} didn't {surely}learn{where}: nothing {what}can be "
@@ -140,8 +140,8 @@ def _decided(
         if not names[SUPPORTED] + names[CONTRADICTED]:
             silent.append(repr(claim))
             continue
-        told = [f"{state} for {listed(which)}" for state, which in names.items() if which]
+        told = [f"{state} for {enumerated(which)}" for state, which in names.items() if which]
         yield f"Decided: {claim!r} is {', '.join(told)}."
     if silent:
         verb = "is" if len(silent) == 1 else "are"
-        yield f"{listed(silent)} {verb} undecided{' everywhere' if len(cells) > 1 else ''}."
+        yield f"{enumerated(silent)} {verb} undecided{' everywhere' if len(cells) > 1 else ''}."

@@ -8,7 +8,7 @@ from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Scores, Worth
 from jbrep.evaluate.table import headline
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.report.serving import lacking, serving, unreadable, untold
-from jbrep.report.worth import Ranked, advice, conditioning, ranked, shown, worth_table
+from jbrep.report.worth import Ranked, advice, conditioning, ranked, worth_table
 from jbrep.report.worth import title as worth_title
 from jbrep.text import SIGNIFICANT, Table, counted, facts, html, interval, number, r2_text, wrapped
 
@@ -131,7 +131,7 @@ def _worths(evaluation: Evaluation, worth: Worth, found: Ranked, width: int | No
         if label not in found.best:
             why += filter(None, [conditioning(evaluation, worth, label)])
             why = why or ["why isn't known"]
-        lines[label] = "; ".join((interval(shown(learned[label]), SIGNIFICANT), *why))
+        lines[label] = "; ".join((interval(learned[label].final, SIGNIFICANT), *why))
     title = worth_title(worth, found) + (f". {_LACKING}" if lacks else "")
     told = facts(lines, width or sys.maxsize, indent=0)
     return "\n".join((wrapped(title, width), told, *_unsaid(evaluation, width)))

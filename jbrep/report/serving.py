@@ -6,7 +6,7 @@ from typing import NamedTuple
 from jbrep.encoders import FULL
 from jbrep.evaluate.evaluation import Evaluation, Lost
 from jbrep.evaluate.table import headline
-from jbrep.report.words import listed
+from jbrep.report.words import enumerated
 from jbrep.text import r2_text
 
 _MEASURES = {  # the first that the full observation tells anything of counts
@@ -50,11 +50,11 @@ def serving(evaluation: Evaluation) -> str:
         answer = f"{good[0]} should serve a controller: it tells {told}."
     else:
         answer = (
-            f"{listed(good)} should serve a controller: each tells {told}. "
+            f"{enumerated(good)} should serve a controller: each tells {told}. "
             f"{_smallest(evaluation, good, lost)}."
         )
     return (
-        f"{answer} But see what {listed(lost)} {'lacks' if len(lost) == 1 else 'lack'}."
+        f"{answer} But see what {enumerated(lost)} {'lacks' if len(lost) == 1 else 'lack'}."
         if lost
         else answer
     )

@@ -202,7 +202,7 @@ def _later(steps: float) -> str:
     return f"{abs(steps):,.0f} {'slower' if steps > 0 else 'faster'}"
 
 
-def listed(names: Sequence[str]) -> str:
+def enumerated(names: Sequence[str]) -> str:
     """Names in a sentence: a, b and c."""
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 

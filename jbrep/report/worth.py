@@ -8,7 +8,7 @@ import numpy as np
 
 from jbrep.encoders import FULL
 from jbrep.evaluate.evaluation import Evaluation, LatentUnits, Learned, Score, Worth
-from jbrep.report.words import listed
+from jbrep.report.words import enumerated
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.scale import best_blind
 from jbrep.text import SIGNIFICANT, Table, interval, number
@@ -49,7 +49,7 @@ def ranked(worth: Worth | None) -> Ranked | None:
     way = next(complete, None)
     if way is None:
         return None
-    means = {label: _bounded(shown(each)) for label, each in by_way[way].items()}
+    means = {label: _bounded(each.final) for label, each in by_way[way].items()}
     blind = best_blind(worth.references)
     floor = worth.references[blind] if blind else -math.inf
     order = sorted(means, key=lambda label: -means[label].value)
@@ -71,11 +71,6 @@ def _is_constant(worth: Worth) -> bool:
     """Whether all that is known was learned from data in which no step is better than another."""
     is_alike = worth.rewards is not None and not worth.rewards[1] and not worth.ends
     return is_alike and AGENT not in worth.learned
-
-
-def shown(learned: Learned) -> Score:
-    """The mean return that counts: with steps of its own, if there were any."""
-    return learned.again or learned.score
 
 
 def _bounded(mean: Score) -> Interval:
@@ -106,13 +101,16 @@ def advice(evaluation: Evaluation, worth: Worth) -> str:
         return f"Take the full observation: by {by}, it is worth more than any code."
     if len(found.best) == 1:
         return f"Take {smallest}: by {by}, it is worth the most."
-    return f"Take {smallest}: by {by}, the smallest of those worth the most, {listed(found.best)}."
+    best = enumerated(found.best)
+    return (
+        f"Take {smallest}: by {by}, the smallest of those not clearly worse than the best, {best}."
+    )
 
 
 def _instead(worth: Worth) -> str:
     """What may say more."""
     surer = "" if AGENT in worth.learned or worth.estimated else "; or ask for --worth agent"
-    return f" Take data of a policy that earns more{surer}."
+    return f" Collect data with a better policy{surer}."
 
 
 def title(worth: Worth, found: Ranked) -> str:
@@ -122,7 +120,7 @@ def title(worth: Worth, found: Ranked) -> str:
     else:
         mean, deviation = worth.rewards or (math.nan, math.nan)
         how = f"{_BY[found.way]} from steps that earn {mean:.2g} on average (SD {deviation:.2g})"
-    where = "as the data let estimate it" if worth.estimated else f"in {worth.episodes} episodes"
+    where = "estimated from the data" if worth.estimated else f"in {worth.episodes} episodes"
     return f"Mean return of {how}, {where}"
 
 
@@ -154,7 +152,7 @@ def conditioning(evaluation: Evaluation, worth: Worth, label: str) -> str:
     """
     learned, units = worth.learned, evaluation.encoders[label].latent_units
     if all(label in learned.get(way, {}) for way in ("trees", "fourier")):
-        trees, fourier = (_bounded(shown(learned[way][label])) for way in ("trees", "fourier"))
+        trees, fourier = (_bounded(learned[way][label].final) for way in ("trees", "fourier"))
         if trees.low > fourier.high:
             return (
                 f"ill-conditioned: trees make {number(trees.value, SIGNIFICANT)} of it, Fourier "

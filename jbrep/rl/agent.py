@@ -1,5 +1,6 @@
 """A stable-baselines3 agent from a preset, and the evaluation of its policy."""
 
+import random
 import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -46,14 +47,22 @@ def make_env(
     num_envs: int,
     seed: int,
     encoder: BaseEncoder,
+    *,
     normalize: bool = False,
     num_threads: int = 1,
     action_repeat: int = 1,
     retries: int = 0,
 ) -> VecEnv:
     """Lanes of a task seen through an encoder, stepped on so many threads."""
-    how = num_threads, None, action_repeat, retries
-    lanes = JitterbugVecEnv(task, num_envs, seed, encoder, *how)
+    lanes = JitterbugVecEnv(
+        task,
+        num_envs,
+        seed,
+        encoder,
+        num_threads=num_threads,
+        action_repeat=action_repeat,
+        retries=retries,
+    )
     return normalized(VecMonitor(lanes)) if normalize else VecMonitor(lanes)
 
 
@@ -115,6 +124,19 @@ def make_agent(
             allocate_adam_state(part)
     agent.action_repeat = hyperparameters.action_repeat
     return cast("BaseAlgorithm", agent)
+
+
+@contextmanager
+def global_random_state_kept() -> Iterator[None]:
+    """Leave the process's random numbers as they were: making an agent seeds them."""
+    numpy_state = np.random.get_state()  # noqa: NPY002 - stable-baselines3 draws there
+    python_state = random.getstate()
+    try:
+        with torch.random.fork_rng(devices=()):
+            yield
+    finally:
+        np.random.set_state(numpy_state)  # noqa: NPY002
+        random.setstate(python_state)
 
 
 def action_repeat(agent: BaseAlgorithm) -> int:
@@ -258,10 +280,6 @@ class Evaluator:
     def close(self) -> None:
         """Free what the environments hold."""
         self._lanes.close()
-
-    def returns(self, agent: BaseAlgorithm, episodes: int | None = None) -> Array:
-        """The return of each episode, (episodes,), see `outcome`."""
-        return self.outcome(agent, episodes).returns
 
     def outcome(self, agent: BaseAlgorithm, episodes: int | None = None) -> Outcome:
         """What comes of each episode: as many as are played at once, or as asked for.

@@ -61,6 +61,10 @@ class History:
     means: list[float] = field(default_factory=list)
     _started: float = field(default_factory=time.monotonic)
 
+    def start(self) -> None:
+        """Count the time from now on: others may have been trained since this was made."""
+        self._started = time.monotonic()
+
     @property
     def seconds(self) -> float:
         """The wall time so far."""
@@ -169,6 +173,16 @@ def read_checkpoint(path: Path) -> tuple[Tensors, CheckpointHeader]:
     """
     tensors, header = container.read(path, "checkpoint", MAX_BYTES)
     return tensors, document_from(header, path, CheckpointHeader)
+
+
+def begun_settings(path: Path) -> RunSettings:
+    """The settings of a run by its checkpoint's header alone, as the file can be large.
+
+    Raises:
+        InputError: it has another version of the format.
+        DamageError: the header isn't what was written.
+    """
+    return document_from(container.peek(path), path, CheckpointHeader).settings
 
 
 class CheckpointFile:

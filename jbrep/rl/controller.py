@@ -164,7 +164,7 @@ class Controller:
             return self._chosen(observation[None])[0]
         action = self.acting.actions(self.encoder.encode(observation))
         if not np.isfinite(action).all():
-            raise InputError("the policy's action is not finite: see what it observed")
+            raise InputError("the policy's action is not finite: is its observation?")
         return action
 
 

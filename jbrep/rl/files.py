@@ -166,7 +166,9 @@ def runs_below(folder: Path) -> list[Path]:
 
 def is_policy_file(path: Path) -> bool:
     """Whether this is a policy's file as `jbrep.rl.policy_file` writes it."""
-    return path.suffix == POLICY_SUFFIX and container.format_of(path) == PolicyHeader.format
+    return (
+        path.suffix == POLICY_SUFFIX and container.peek(path).get("format") == PolicyHeader.format
+    )
 
 
 def read_evaluations(folder: Path) -> list[Evaluation]:

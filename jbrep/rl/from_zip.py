@@ -29,12 +29,6 @@ from jbrep.rl.presets import sb3_class
 from jbrep.rl.trained import Trained
 
 _PARTS = (spaces.Box, spaces.Discrete, spaces.MultiBinary)  # which `deterministic_actor` knows
-_UNUSED: dict[str, Any] = {  # what only training needs: memory, or an environment to be made with
-    "buffer_size": 1,
-    "replay_buffer_class": None,
-}
-
-
 _OTHERS = "its statistics are of other observations"
 
 
@@ -138,7 +132,12 @@ def _loaded(raw: bytes, path: Path, algorithm: str) -> tuple[BaseAlgorithm, ZipM
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of schedules that another Python pickled
-            unused = _UNUSED | {"replay_buffer_kwargs": {}}  # to which loading may add
+            # what only training needs: memory, or an environment to be made with
+            unused: dict[str, Any] = {
+                "buffer_size": 1,
+                "replay_buffer_class": None,
+                "replay_buffer_kwargs": {},
+            }
             agent = kind.load(io.BytesIO(raw), device="cpu", custom_objects=unused)
         return agent, read_metadata(raw, path)
     except InputError:

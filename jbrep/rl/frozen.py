@@ -16,6 +16,7 @@ from jbrep.rl.files import ENCODER, PolicyHeader, is_policy_file
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_file import MAX_BYTES, unpack
 from jbrep.rl.trained import Trained, of_file, pack
+from jbrep.text import printable
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def kept(source: str, path: Path) -> Frozen | None:
 
 def _line(source: str) -> str:
     """A run's folder as manifests name it."""
-    return "".join(c if c.isprintable() else "?" for c in str(Path(source)))[-MAX_LETTERS:]
+    return printable(str(Path(source)))[-MAX_LETTERS:]
 
 
 def read_frozen(folder: Path, settings: Mapping[str, Any]) -> Frozen:

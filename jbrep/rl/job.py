@@ -24,7 +24,7 @@ from jbrep.records.commit import commits
 from jbrep.records.storage import exists, inside, read_file, write_whole
 from jbrep.records.tables import write_rows
 from jbrep.rl.agent import Evaluator, action_repeat, restore_statistics, statistics_of
-from jbrep.rl.checkpoint import CheckpointFile, History
+from jbrep.rl.checkpoint import CheckpointFile, History, begun_settings
 from jbrep.rl.files import (
     BEGINNING,
     CHECKPOINT,
@@ -44,13 +44,13 @@ from jbrep.rl.files import (
     read_run,
     write_infos,
 )
-from jbrep.rl.policy import run_settings
 from jbrep.rl.policy_file import MAX_BYTES, read
 from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
 from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import CPU, MAX_LINE
 from jbrep.rl.trained import Trained, fill_whole, pack_whole
+from jbrep.text import printable
 
 Ended = tuple["Job", RunRecord]
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
@@ -141,7 +141,10 @@ class Job:
         """Settings with evaluations as far apart as before, where a shorter run goes on."""
         if self.run.evaluate_every or not is_run(self.folder):
             return settings
-        before = run_settings(self.folder)
+        if exists(self.folder / RUN):
+            before = read_run(self.folder).settings
+        else:
+            before = begun_settings(self.folder / CHECKPOINT)
         same = settings.replace(evaluate_every=before.evaluate_every)
         return same if before.is_extended_by(same) else settings
 
@@ -165,8 +168,8 @@ class Job:
             raise InputError(f"{what}: it failed; choose another folder")
         if schedules := before.settings.schedules:
             raise InputError(
-                f"{what}: its {schedules[0]} fell to 0 in them, which a longer run's doesn't; "
-                "choose another folder"
+                f"{what}: its {schedules[0]} has fallen to 0 already, where a longer run's "
+                "hasn't; choose another folder"
             )
         if not exists(self.folder / CHECKPOINT):
             raise InputError(
@@ -205,6 +208,7 @@ class Job:
             InputError: the policy that the run begins with can't be read, or doesn't fit.
             DamageError: that isn't what was written.
         """
+        self.history.start()
         if sha256 := self.settings.begin_from:
             path = self.folder / BEGINNING
             if not exists(path) or _sha256(path) != sha256:
@@ -251,7 +255,7 @@ class Job:
             self.evaluator.close()
             del self.evaluator
 
-    def evaluate_finally(self, agent: BaseAlgorithm) -> None:
+    def final_evaluation(self, agent: BaseAlgorithm) -> None:
         """Evaluate a trained agent, in more episodes; see `evaluate`.
 
         This replaces an evaluation that was made after the last step as the run is kept to go on.
@@ -274,7 +278,7 @@ class Job:
         logger.dump(agent.num_timesteps)
 
     def step_of(self, agent: BaseAlgorithm) -> int:
-        """Of training, in control steps."""
+        """Training steps so far, in control steps."""
         return self.settings.control_steps(agent.num_timesteps)
 
     def end(self, agent: BaseAlgorithm, failure: str) -> RunRecord:
@@ -313,10 +317,10 @@ class Job:
     def _record(
         self, agent: BaseAlgorithm, failure: str, tables: Mapping[str, str], policy: bytes
     ) -> RunRecord:
-        steps = self.step_of(agent)
+        steps, told = self.step_of(agent), printable(failure)[: MAX_LINE // 2]
         return RunRecord(
             status=FAILED if failure else FINISHED,
-            reason=f"{_one_line(failure)} after {steps:,} steps" if failure else None,
+            reason=f"{told} after {steps:,} steps" if failure else None,
             settings=self.settings,
             latent_size=self.encoder.latent_size,
             steps=steps,
@@ -331,11 +335,6 @@ class Job:
 
 def _sha256(path: Path) -> str:
     return hashlib.sha256(read_file(path, MAX_BYTES)).hexdigest()
-
-
-def _one_line(text: str) -> str:
-    """Text as run.json may hold it, whatever an environment says."""
-    return "".join(c if c.isprintable() else "?" for c in text)[: MAX_LINE // 2]
 
 
 def _cpu() -> str:

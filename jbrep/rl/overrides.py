@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from jbrep.errors import InputError
 from jbrep.records.record import converted, shown, to_plain
-from jbrep.rl.agent import ACTIVATIONS, make_agent, one_line
+from jbrep.rl.agent import ACTIVATIONS, global_random_state_kept, make_agent, one_line
 from jbrep.rl.presets import Hyperparameters, NetArch, get_preset, parameters_of, sb3_class
 
 _MOST = 10**9  # of any number
@@ -146,6 +146,14 @@ def check_shape(algorithm: str, hyperparameters: Hyperparameters) -> Hyperparame
     )
 
 
+def without_buffer(algorithm: str, hyperparameters: Hyperparameters) -> Hyperparameters:
+    """The same with the smallest replay buffer, for an agent that nothing is added to."""
+    if not is_off_policy(algorithm):
+        return hyperparameters
+    of_class = {**hyperparameters.algorithm_kwargs, "buffer_size": 1}
+    return hyperparameters.replace(algorithm_kwargs=of_class)
+
+
 def _check_name(algorithm: str, name: str) -> None:
     if name in _REFUSED:
         raise InputError(f"{name} can't be set: {_REFUSED[name]}")
@@ -241,12 +249,11 @@ class _Body(gymnasium.Env[Any, Any]):
 
 def _build(algorithm: str, chosen: Hyperparameters) -> None:
     """Build an agent, so that what stable-baselines3 refuses is known before the first step."""
-    small = {"buffer_size": chosen.num_envs} if "buffer_size" in _parameters(algorithm) else {}
-    quick = chosen.replace(algorithm_kwargs={**chosen.algorithm_kwargs, **small})
+    small = without_buffer(algorithm, chosen)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), global_random_state_kept():
             warnings.simplefilter("ignore")  # training gives them
-            make_agent(algorithm, quick, DummyVecEnv([_Body] * chosen.num_envs), 0)
+            make_agent(algorithm, small, DummyVecEnv([_Body] * chosen.num_envs), 0)
     except Exception as error:  # stable-baselines3's own checks raise many types
         raise InputError(
             f"stable-baselines3 can't make {algorithm} with these settings: {one_line(error)}"

@@ -79,9 +79,10 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
         return f"{self.label}/seed-{self.seed}"
 
     def is_evaluation_due(self, step: int, keep_checkpoint: bool = False) -> bool:
-        """Whether the policy is to be evaluated after so many steps, which aren't all.
+        """Whether the policy is to be evaluated after so many steps.
 
-        Where the run is kept, to go on later, they may be: the last evaluation comes after it.
+        The last step is left to the final evaluation, unless the run is kept to go on later: a
+        longer run would be evaluated there.
         """
         at_once = self.control_steps(self.hyperparameters.num_envs)
         return step % self.evaluate_every < at_once and (keep_checkpoint or step < self.steps)

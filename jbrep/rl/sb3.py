@@ -16,7 +16,6 @@ from stable_baselines3.common.noise import (
     OrnsteinUhlenbeckActionNoise,
     VectorizedActionNoise,
 )
-from stable_baselines3.common.vec_env import VecMonitor
 
 from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
@@ -61,15 +60,24 @@ def _train(job: Job, session: Session) -> RunRecord:
     job.keep_encoder()
     seed = training_seed(run.seed)
     lanes = chosen.num_envs
-    how = chosen.normalize, job.threads_for(lanes), chosen.action_repeat
+    made = make_env(
+        run.task,
+        lanes,
+        seed,
+        job.encoder,
+        normalize=chosen.normalize,
+        num_threads=job.threads_for(lanes),
+        action_repeat=chosen.action_repeat,
+        retries=job.retries,
+    )
     with (
-        closing(make_env(run.task, lanes, seed, job.encoder, *how, job.retries)) as env,
+        closing(made) as env,
         closing(job),
     ):
         agent = make_agent(settings.algorithm, chosen, env, run.seed, settings.episode_steps)
         env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
         job.prepare(agent, session.writers)
-        job.share(_envs(agent)[1].lanes)
+        job.share(_env(agent).lanes)
         failure = _learn(agent, settings.agent_steps, follower)
         return job.end(agent, failure)
 
@@ -147,8 +155,7 @@ class _Follower(BaseCallback):
         """
         self._job.evaluate(self.model)
         if self._job.is_one_robot:
-            _, env = _envs(self.model)
-            first: Any = env.restart()
+            first: Any = _env(self.model).restart()
             if normalizer := self.model.get_vec_normalize_env():
                 normalizer.old_obs = first
                 if observed is self.model._last_obs:  # else the transition isn't stored yet
@@ -162,7 +169,7 @@ class _Follower(BaseCallback):
         if self._session.keep_checkpoint:
             _draw_noise(self.model)
             self._job.checkpoint.write(take(self.model))
-        self._job.evaluate_finally(self.model)
+        self._job.final_evaluation(self.model)
         self._tell()
 
     def _tell(self) -> None:
@@ -186,8 +193,7 @@ def take(agent: BaseAlgorithm) -> Snapshot:
     """Take a snapshot of an agent between two rollouts; its tensors share the agent's memory."""
     kind, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws there
     tensors, counters = checkpoint.take(agent)
-    _, env = _envs(agent)
-    tensors |= {f"{LANES}{name}": values for name, values in env.state.items()}
+    tensors |= {f"{LANES}{name}": values for name, values in _env(agent).state.items()}
     tensors |= {name: getattr(*place) for name, place in _arrays(agent).items()}
     tensors |= {"torch": torch.get_rng_state().numpy(), "numpy": np.asarray(keys)}
     if noise := _state_dependent_noise(agent):
@@ -212,8 +218,7 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
             values[:] = tensors[f"buffer.{name}"]
     for name, place in _arrays(agent).items():
         setattr(*place, tensors[name])
-    _, env = _envs(agent)
-    env.restore(without(LANES, tensors))
+    _env(agent).restore(without(LANES, tensors))
     agent.action_space.np_random.bit_generator.state = counters["action_space"]
     _restore_draws(agent, tensors)
     kind, *rest = counters["numpy"]
@@ -222,10 +227,11 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
 
 def _arrays(agent: BaseAlgorithm) -> dict[str, tuple[object, str]]:
     """Which arrays decide how a rollout goes on: the object that has each, and its attribute."""
-    monitor, _ = _envs(agent)
+    normalizer = agent.get_vec_normalize_env()
+    monitor = normalizer.venv if normalizer else agent.env
     last = ("_last_obs", "_last_episode_starts")
     places: dict[str, tuple[object, str]] = {f"rollout.{name}": (agent, name) for name in last}
-    if agent.get_vec_normalize_env():
+    if normalizer:
         places[_UNSCALED] = agent, _UNSCALED
     for i, noise in enumerate(_noises(agent)):
         if memory := _MEMORIES.get(type(noise)):
@@ -258,13 +264,10 @@ def _state_dependent_noise(agent: BaseAlgorithm) -> StateDependentNoiseDistribut
     return distribution if is_one else None
 
 
-def _envs(agent: BaseAlgorithm) -> tuple[VecMonitor, JitterbugVecEnv]:
-    normalizer = agent.get_vec_normalize_env()
-    monitor = normalizer.venv if normalizer else agent.env
-    assert isinstance(monitor, VecMonitor)
-    env = monitor.unwrapped
+def _env(agent: BaseAlgorithm) -> JitterbugVecEnv:
+    env = agent.env.unwrapped if agent.env else None
     assert isinstance(env, JitterbugVecEnv)
-    return monitor, env
+    return env
 
 
 def _buffer(agent: BaseAlgorithm) -> ReplayBuffer | None:

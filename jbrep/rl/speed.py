@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from math import gcd
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,12 +30,14 @@ def estimate(runs: Sequence[Run]) -> float:
     first = runs[0]
     if is_off_policy(first.learner.algorithm):
         runs = [run.replace(learner=run.learner.overridden(_at_once(run))) for run in runs]
-    with TemporaryDirectory() as folder, single_torch_thread():
+    with TemporaryDirectory() as folder, single_torch_thread(), ExitStack() as opened:
         jobs = [Job(run, Path(folder) / str(i)) for i, run in enumerate(runs)]
+        for job in jobs:
+            opened.callback(job.close)
         settings, evaluator = jobs[0].settings, jobs[0].evaluator
         trial = _together if settings.trainer == COHORT else _alone
-        per_step, agent = trial(jobs)
-        per_evaluation = len(jobs) * _seconds(lambda: evaluator.returns(agent))
+        per_step, agent = trial(jobs, opened)
+        per_evaluation = len(jobs) * _seconds(lambda: evaluator.outcome(agent))
     at_end = settings.final_episodes / first.evaluation_episodes
     evaluations = first.steps // settings.evaluate_every + at_end
     return first.steps * per_step + evaluations * per_evaluation
@@ -50,20 +53,27 @@ def _at_once(run: Run) -> dict[str, int]:
     return {"learning_starts": 0, "train_freq": every, "gradient_steps": many}
 
 
-def _alone(jobs: Sequence[Job]) -> tuple[float, BaseAlgorithm]:
+def _alone(jobs: Sequence[Job], opened: ExitStack) -> tuple[float, BaseAlgorithm]:
     """Seconds of a step, and an agent."""
     (job,) = jobs
     run, chosen = job.run, job.settings.hyperparameters
-    how = chosen.normalize, 1, chosen.action_repeat
-    env = make_env(run.task, chosen.num_envs, 0, job.encoder, *how)
+    env = make_env(
+        run.task,
+        chosen.num_envs,
+        0,
+        job.encoder,
+        normalize=chosen.normalize,
+        action_repeat=chosen.action_repeat,
+    )
+    opened.callback(env.close)
     agent = make_agent(run.learner.algorithm, chosen, env, 0, job.settings.episode_steps)
     learned = _seconds(lambda: agent.learn(_MIN_STEPS))  # whole rollouts, so at least one
     return learned / job.step_of(agent), agent
 
 
-def _together(jobs: Sequence[Job]) -> tuple[float, BaseAlgorithm]:
+def _together(jobs: Sequence[Job], opened: ExitStack) -> tuple[float, BaseAlgorithm]:
     """The same of a cohort: a step of each run."""
-    cohort = Cohort([Member(job, []) for job in jobs])
+    cohort = opened.enter_context(closing(Cohort([Member(job, []) for job in jobs])))
     cohort.begin()
 
     def learn() -> None:

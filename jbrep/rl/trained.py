@@ -16,11 +16,17 @@ from jbrep.envs.task import Array, Task
 from jbrep.errors import DamageError, InputError
 from jbrep.records import container
 from jbrep.records.container import Tensors, without
-from jbrep.records.storage import write_whole
-from jbrep.rl.agent import Spaces, deterministic_actor, make_agent, one_line, preprocessor
+from jbrep.rl.agent import (
+    Spaces,
+    deterministic_actor,
+    global_random_state_kept,
+    make_agent,
+    one_line,
+    preprocessor,
+)
 from jbrep.rl.files import PolicyHeader
 from jbrep.rl.normalization import Statistics
-from jbrep.rl.overrides import check_shape
+from jbrep.rl.overrides import check_shape, without_buffer
 from jbrep.rl.policy_file import ACTING, ENCODER, TRAINING, PolicyFile
 from jbrep.rl.run_settings import RunSettings
 
@@ -120,8 +126,10 @@ def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
         raise InputError(f"{encoder.name} is not the encoder that the run in {path} was made with")
     encoder.check_task(task)
     shape = check_shape(settings.algorithm, settings.hyperparameters)
+    small = without_buffer(settings.algorithm, shape)
     try:
-        agent = make_agent(settings.algorithm, shape, Spaces(task, encoder), settings.seed)
+        with global_random_state_kept():
+            agent = make_agent(settings.algorithm, small, Spaces(task, encoder), settings.seed)
     except (AssertionError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"no policy can be made from the settings of the run: {one_line(error)}"
@@ -173,15 +181,6 @@ def _pack(trained: Trained, run: str, tensors: Tensors) -> bytes:
 
 def _named(prefix: str, weights: Mapping[str, torch.Tensor]) -> Tensors:
     return {f"{prefix}{name}": each.numpy(force=True) for name, each in weights.items()}
-
-
-def save(trained: Trained, path: Path, run: str) -> None:
-    """Write a policy's file, to act with alone, whole or not at all.
-
-    Raises:
-        InputError: as `pack`, or it can't be written.
-    """
-    write_whole(path, pack(trained, run))
 
 
 def fill_whole(file: PolicyFile, policy: BasePolicy) -> None:

@@ -73,9 +73,6 @@ class Objective(nn.Module, ABC):
         """
         return (1 + math.cos(math.pi * progress)) / 2
 
-    def after_step(self) -> None:
-        """What follows a step of the optimiser, such as moving a target network."""
-
     def layers(self) -> tuple[Layers, Layers | None]:
         """The layers of encoder and decoder; None where no decoder is learned."""
         return layers(self.encoder), None

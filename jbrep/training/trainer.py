@@ -133,7 +133,6 @@ class Trainer:
             rows = min(self._batch_size, count - i * self._batch_size)
             total += self.objective.gradient(batch) * rows
             self.optimiser.step()
-            self.objective.after_step()
         self._record(number, float(total) / count, self._held_out_loss())
 
     def _held_out_loss(self) -> float:

@@ -10,7 +10,7 @@ from torch import Tensor
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.errors import InputError
-from jbrep.training.rows import Rows, available_memory, rows_of
+from jbrep.training.rows import Load, Rows, available_memory, rows_of
 
 _WATCHED = 100_000  # held-out windows whose loss is reported after each epoch
 _WATCHED_NUMBERS = 1 << 22  # at most in their rows: 16 MiB
@@ -94,12 +94,16 @@ class Windows:
 
     @cached_property
     def _scaled(self) -> Rows:
-        return rows_of(self._data.load, self._rows, self.size, self.device, self._memory)
+        return self._rows_of(self._data.load, self.size)
 
     @cached_property
     def _action(self) -> Rows:
-        width = self._data.task.action_size
-        return rows_of(self._data.actions, self._rows, width, self.device, self._memory)
+        return self._rows_of(self._data.actions, self._data.task.action_size)
+
+    def _rows_of(self, load: Load, width: int) -> Rows:
+        """Rows of so many numbers, in their share of the memory that rows and actions may take."""
+        memory = self._memory * width // (self.size + self._data.task.action_size)
+        return rows_of(load, self._rows, width, self.device, memory)
 
     @cached_property
     def _earned(self) -> Tensor:

@@ -22,4 +22,4 @@ def check_ways(asked: Iterable[str]) -> None:
         InputError: one isn't.
     """
     for each in asked:
-        choose(each, WORTH, "way of worth")
+        choose(each, WORTH, "way to find a code's worth")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.envs.task import Array
-from jbrep.worth.steps import Held
+from jbrep.worth.steps import Transitions
 
 Codes = NDArray[np.float32]  # (n, l)
 Actions = NDArray[np.float32]  # (n, k), in [-1, 1]
@@ -32,8 +32,8 @@ class Coded(NamedTuple):
     """Held steps as a code shows them: before and after, (n, l) each."""
 
     code: Codes
-    following: Codes
-    held: Held
+    next_code: Codes
+    held: Transitions
 
 
 class Values(Protocol):
@@ -57,7 +57,7 @@ class Trees:
 
         given = np.hstack((steps.code, steps.held.action))
         held = steps.held
-        split_by = np.column_stack((held.reward, held.goes_on, steps.following - steps.code))
+        split_by = np.column_stack((held.reward, held.continues, steps.next_code - steps.code))
         deviation = split_by.std(axis=0)
         split_by = split_by[:, deviation > 0] / deviation[deviation > 0]
         if not split_by.size:
@@ -151,12 +151,12 @@ def q_iteration(values: Values, steps: Coded, gamma: float, tries: Actions) -> C
     def of_each(prepared: Any) -> Array:
         return values.at(prepared).reshape(-1, len(tries))
 
-    following = prepared(steps.following)
-    backup(values, steps.held, gamma, lambda: of_each(following).max(axis=1))
+    next_code = prepared(steps.next_code)
+    backup(values, steps.held, gamma, lambda: of_each(next_code).max(axis=1))
     return lambda codes: tries[of_each(prepared(codes)).argmax(axis=1)]
 
 
-def backup(values: Values, held: Held, gamma: float, ahead: Callable[[], Array]) -> None:
+def backup(values: Values, held: Transitions, gamma: float, ahead: Callable[[], Array]) -> None:
     """Fit values to rewards and what comes after, again and again.
 
     Args:
@@ -166,10 +166,10 @@ def backup(values: Values, held: Held, gamma: float, ahead: Callable[[], Array])
         ahead: by the values of now, what comes after each step, (n,).
     """
     least, largest = held.reward.min() / (1 - gamma), held.reward.max() / (1 - gamma)
-    if not held.goes_on.all():  # nothing comes after an end
+    if not held.continues.all():  # nothing comes after an end
         least, largest = min(least, 0.0), max(largest, 0.0)
     wanted = held.reward
     for _ in range(_BACKUPS):
         values.fit(wanted)
-        wanted = held.reward + gamma * held.goes_on * np.clip(ahead(), least, largest)
+        wanted = held.reward + gamma * held.continues * np.clip(ahead(), least, largest)
     values.fit(wanted)

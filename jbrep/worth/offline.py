@@ -18,7 +18,7 @@ from jbrep.rl.files import EVALUATION_SEED
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within
 from jbrep.worth import fitted, planning
 from jbrep.worth.fitted import Choose, Coded, Fourier, Trees, Values
-from jbrep.worth.steps import Held, choices, joined, most, recorded, stored
+from jbrep.worth.steps import Transitions, candidates, joined, most, recorded, stored
 
 _Learn = Callable[[Coded, Task, float], Choose]  # with the discount of a held step
 
@@ -30,7 +30,7 @@ _OWN_SEED = EVALUATION_SEED // 2
 
 
 def _fitted(kind: Callable[[Coded], Values], steps: Coded, task: Task, gamma: float) -> Choose:
-    return fitted.q_iteration(kind(steps), steps, gamma, choices(task))
+    return fitted.q_iteration(kind(steps), steps, gamma, candidates(task))
 
 
 def _planned(model: Callable[[Coded], Any], steps: Coded, task: Task, gamma: float) -> Choose:
@@ -59,8 +59,8 @@ class Ground:
 
     task: Task
     hold: int
-    seen: Held
-    unseen: Held
+    seen: Transitions
+    unseen: Transitions
     lanes: Lanes | None
 
     @classmethod
@@ -117,10 +117,10 @@ def bounds_of(task: Task) -> Bounds:
     return Bounds.of(task.return_floor, task.return_ceiling)
 
 
-def _coded(encoder: BaseEncoder, steps: Held) -> Coded:
+def _coded(encoder: BaseEncoder, steps: Transitions) -> Coded:
     before, after = (
         np.asarray(encoder.encode(each), np.float32)
-        for each in (steps.observation, steps.following)
+        for each in (steps.observation, steps.next_observation)
     )
     return Coded(before, after, steps)
 
@@ -141,10 +141,10 @@ def _played(lanes: Lanes, act: Actor, hold: int) -> Score:
     return score(mean_within(returns, bounds_of(lanes.task), LEVEL))
 
 
-def _own_steps(lanes: Lanes, act: Actor, hold: int) -> list[Held]:
+def _own_steps(lanes: Lanes, act: Actor, hold: int) -> list[Transitions]:
     """Steps of a policy that explores, of each episode."""
     task, random = lanes.task, np.random.default_rng(0)
-    drawn = choices(task)
+    drawn = candidates(task)
 
     def explore(observation: Array) -> Array:
         chosen, count = act(observation), len(observation)
@@ -163,7 +163,7 @@ def _estimated(encoder: BaseEncoder, ground: Ground, choose: Choose) -> Score:
     """
     steps, task = _coded(encoder, ground.unseen), ground.task
     values = Trees(steps)
-    ahead = values.prepare(steps.following, choose(steps.following))
+    ahead = values.prepare(steps.next_code, choose(steps.next_code))
     fitted.backup(values, steps.held, ground.gamma, lambda: values.at(ahead))
     starts = steps.code[steps.held.first]
     value = values.at(values.prepare(starts, choose(starts)))

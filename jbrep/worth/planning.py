@@ -36,10 +36,10 @@ class Model(NamedTuple):
         """The next codes (n, l), the rewards (n,), and the shares that go on after them, (n,)."""
         size = codes.shape[1]
         told = self.predict(np.hstack((codes, actions)))
-        following = np.clip(codes + told[:, :size], self.low, self.high)
+        next_code = np.clip(codes + told[:, :size], self.low, self.high)
         ends = told.shape[1] > size + 1
-        goes_on = np.clip(told[:, size + 1], 0, 1) if ends else np.ones(len(codes))
-        return following.astype(np.float32), told[:, size], goes_on
+        continues = np.clip(told[:, size + 1], 0, 1) if ends else np.ones(len(codes))
+        return next_code.astype(np.float32), told[:, size], continues
 
 
 def linear_model(steps: Coded) -> Model:
@@ -57,12 +57,12 @@ def _told(steps: Coded) -> tuple[NDArray[Any], NDArray[Any]]:
     """What a model is given, (n, l + k), and what it is to predict, as `Model.predict` has it."""
     held = steps.held
     given = np.hstack((steps.code, held.action))
-    ends = () if held.goes_on.all() else (held.goes_on,)
-    return given, np.column_stack((steps.following - steps.code, held.reward, *ends))
+    ends = () if held.continues.all() else (held.continues,)
+    return given, np.column_stack((steps.next_code - steps.code, held.reward, *ends))
 
 
 def _model(steps: Coded, predict: Predictor) -> Model:
-    return Model(predict, steps.following.min(axis=0), steps.following.max(axis=0))
+    return Model(predict, steps.next_code.min(axis=0), steps.next_code.max(axis=0))
 
 
 def planned(model: Model, gamma: float, size: int) -> Choose:
@@ -97,7 +97,7 @@ def _worth(model: Model, codes: Codes, drawn: Array, gamma: float) -> Array:
     flat = drawn.reshape(count * many, *drawn.shape[2:]).astype(np.float32)
     at, total, weight = np.repeat(codes, many, axis=0), np.zeros(len(flat)), np.ones(len(flat))
     for ahead in range(drawn.shape[2]):
-        at, reward, goes_on = model.step(at, flat[:, ahead])
+        at, reward, continues = model.step(at, flat[:, ahead])
         total += weight * reward
-        weight *= gamma * goes_on
+        weight *= gamma * continues
     return total.reshape(count, many)

@@ -15,23 +15,23 @@ _LEVELS, _DRAWN = 11, 32  # actions that are tried: of one number, and of severa
 _NUMBERS = 300_000  # steps times actions, at most: values that are computed at once
 
 
-class Held(NamedTuple):
+class Transitions(NamedTuple):
     """n steps, each of several control steps in which an action is held.
 
     Attributes:
         observation: before each, (n, d) in physical units.
         action: the mean action in it, scaled to [-1, 1], (n, k).
         reward: the mean reward of its control steps, (n,).
-        following: the observation after it, (n, d).
-        goes_on: 0 where a state ended the episode in it, else 1, (n,).
+        next_observation: the observation after it, (n, d).
+        continues: 0 where a state ended the episode in it, else 1, (n,).
         first: whether it begins an episode, (n,).
     """
 
     observation: NDArray[np.float32]
     action: NDArray[np.float32]
     reward: Array
-    following: NDArray[np.float32]
-    goes_on: Array
+    next_observation: NDArray[np.float32]
+    continues: Array
     first: NDArray[np.bool_]
 
     def __len__(self) -> int:
@@ -47,7 +47,7 @@ class _Episode(NamedTuple):
     terminated: bool
 
 
-def choices(task: Task) -> NDArray[np.float32]:
+def candidates(task: Task) -> NDArray[np.float32]:
     """Actions to try, scaled to [-1, 1], (m, k): a grid of one number, else a fixed draw."""
     if task.action_size == 1:
         return np.linspace(-1, 1, _LEVELS, dtype=np.float32)[:, None]
@@ -57,10 +57,10 @@ def choices(task: Task) -> NDArray[np.float32]:
 
 def most(task: Task) -> int:
     """How many held steps to learn from, at most."""
-    return _NUMBERS // len(choices(task))
+    return _NUMBERS // len(candidates(task))
 
 
-def stored(data: Dataset, episodes: NDArray[np.int64], hold: int, limit: int) -> Held:
+def stored(data: Dataset, episodes: NDArray[np.int64], hold: int, limit: int) -> Transitions:
     """Held steps of some episodes of a data set, in their order, of as many as reach a limit.
 
     Raises:
@@ -74,7 +74,7 @@ def stored(data: Dataset, episodes: NDArray[np.int64], hold: int, limit: int) ->
             seen = np.concatenate((each["observation"], each.record["final_observation"][None]))
             yield _Episode(seen, each["action"], each["reward"], bool(each.record["terminated"]))
 
-    found = list[Held]()
+    found = list[Transitions]()
     for each in opened():
         if sum(map(len, found)) >= limit:
             break
@@ -88,7 +88,7 @@ def stored(data: Dataset, episodes: NDArray[np.int64], hold: int, limit: int) ->
     return joined(found)
 
 
-def recorded(recording: Recording, task: Task, hold: int) -> list[Held]:
+def recorded(recording: Recording, task: Task, hold: int) -> list[Transitions]:
     """Held steps of each episode that was just played, if it is as long as an action is held."""
     return [
         _held(
@@ -106,12 +106,12 @@ def recorded(recording: Recording, task: Task, hold: int) -> list[Held]:
     ]
 
 
-def joined(parts: Sequence[Held]) -> Held:
+def joined(parts: Sequence[Transitions]) -> Transitions:
     """All steps of several, one after the other."""
-    return Held(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return Transitions(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _held(episode: _Episode, task: Task, hold: int) -> Held:
+def _held(episode: _Episode, task: Task, hold: int) -> Transitions:
     """An episode as steps of `hold` control steps each; what is left at its end is not used.
 
     A state that ends the episode is in its last step, which begins later than the others would.
@@ -121,13 +121,13 @@ def _held(episode: _Episode, task: Task, hold: int) -> Held:
     if episode.terminated and starts[-1] + hold < steps:
         starts = np.append(starts, steps - hold)
     within = starts[:, None] + np.arange(hold)
-    goes_on = np.ones(len(starts))
-    goes_on[-1] -= episode.terminated
-    return Held(
+    continues = np.ones(len(starts))
+    continues[-1] -= episode.terminated
+    return Transitions(
         observation=episode.observation[starts],
         action=task.scale_action(episode.action[within].mean(axis=1)).astype(np.float32),
         reward=episode.reward[within].mean(axis=1, dtype=np.float64),
-        following=episode.observation[starts + hold],
-        goes_on=goes_on,
+        next_observation=episode.observation[starts + hold],
+        continues=continues,
         first=starts == 0,
     )

@@ -81,15 +81,22 @@ class _Found:
     """An evaluation whose file has what codes are worth, as far as that is known.
 
     Args:
-        evaluation: to begin with; what was estimated isn't compared with what was played.
+        evaluation: to begin with.
         path: of its file.
         estimated: whether the environment can't be made.
+
+    Raises:
+        InputError: what was estimated would stand beside what is played.
     """
 
     def __init__(self, evaluation: Evaluation, path: Path, estimated: bool):
-        fresh = Worth(estimated=estimated, episodes=EPISODES)
-        before = evaluation.worth
-        self.worth = before if before and before.estimated == estimated else fresh
+        if (before := evaluation.worth) and before.learned and before.estimated != estimated:
+            how = ("estimated", "can") if before.estimated else ("played", "can't")
+            raise InputError(
+                f"{path} has returns that were {how[0]}, and the environment {how[1]} be made now: "
+                "--import the module that it needs, or choose another --out"
+            )
+        self.worth = before or Worth(estimated=estimated, episodes=EPISODES)
         self.evaluation, self._path = evaluation, path
 
     def missing(self, way: str, labels: Mapping[str, Any]) -> list[str]:
@@ -133,7 +140,7 @@ def _train(found: _Found, encoders: Mapping[str, BaseEncoder], data: Dataset, fo
 
 def _learn(found: _Found, missing: Mapping[str, Mapping[str, BaseEncoder]], ground: Ground) -> None:
     """Learn from the data in each way what isn't known of each code."""
-    found.keep(rewards=ground.rewards, ends=not ground.seen.goes_on.all())
+    found.keep(rewards=ground.rewards, ends=not ground.seen.continues.all())
     with Progress(total=sum(map(len, missing.values())), unit="code") as progress:
         for way, encoders in missing.items():
             for label, encoder in encoders.items():

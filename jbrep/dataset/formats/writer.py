@@ -27,7 +27,7 @@ from jbrep.errors import InputError, Notice, kind_and_line
 from jbrep.progress import Progress
 from jbrep.records.record import converted
 from jbrep.records.storage import check_space, make_folder, publish_folder, unfinished
-from jbrep.text import counted
+from jbrep.text import counted, printable
 
 _SHARD_ROWS = 20_000
 _MOST_SHARDS = 5_000
@@ -218,10 +218,9 @@ def _action_bounds(source: Source, survey: _Survey) -> tuple[Array, Array]:
 def _settings(source: Source, survey: _Survey, task: Task, reward: str) -> DataSettings:
     steps = sum(survey.lengths)
     rows = max(_SHARD_ROWS, steps // _MOST_SHARDS)
-    name = "".join(c if c.isprintable() else "?" for c in source.name)
     return DataSettings(
         task=task,
-        policy={"kind": IMPORTED, "source": name[-MAX_LETTERS:]},
+        policy={"kind": IMPORTED, "source": printable(source.name)[-MAX_LETTERS:]},
         unrewarded=UNSET if source.has_rewards else True,
         reward=with_hash(reward) if reward else UNSET,
         steps=steps,

@@ -66,7 +66,7 @@ class Cohort:
 
     @property
     def step(self) -> int:
-        """Of training, in control steps."""
+        """Training steps so far, in control steps."""
         return self._settings.control_steps(self.agent_step)
 
     @property
@@ -199,15 +199,8 @@ class Cohort:
         for member in self.members:
             member.agent._n_updates = self._n_updates
 
-    def evaluate(self) -> None:
-        """Let each member play its policy that hasn't failed."""
-        self._let_play(Job.evaluate)
-
-    def evaluate_finally(self) -> None:
-        """The same after training, in more episodes."""
-        self._let_play(Job.evaluate_finally)
-
-    def _let_play(self, evaluation: Callable[[Job, BaseAlgorithm], None]) -> None:
+    def evaluate(self, evaluation: Callable[[Job, BaseAlgorithm], None] = Job.evaluate) -> None:
+        """Let each member that hasn't failed play its policy."""
         self.write_to_agents()
         for member in self.members:
             if not member.failure:
@@ -241,17 +234,13 @@ class Cohort:
         """Whose lane of all it is."""
         return self.members[lane // self._lanes]
 
-    def survivors(self) -> "Cohort":
-        """Those that haven't failed, as far as they are."""
-        if not self.failed:
-            return self
+    def survivors(self) -> tuple["Cohort", list[Snapshot]]:
+        """A cohort of those that haven't failed, and what restores it as far as they are."""
         self.write_to_agents()
         going = [member for member in self.members if not member.failure]
         snapshots = [self.take(member) for member in going]
         self.close()
-        others = Cohort(going)
-        others.restore(snapshots)
-        return others
+        return Cohort(going), snapshots
 
     def take(self, member: Member) -> Snapshot:
         """Everything that decides how a member's training continues, whoever is beside it.

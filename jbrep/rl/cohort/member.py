@@ -26,6 +26,7 @@ from jbrep.rl.files import Episode
 from jbrep.rl.job import Job
 from jbrep.rl.noise import Memory, Noise, beginning
 from jbrep.rl.normalization import normalized
+from jbrep.rl.overrides import without_buffer
 
 Indices = NDArray[np.int64]
 _LOG_EVERY = 4  # episodes, as in stable-baselines3
@@ -51,8 +52,7 @@ class Member:
 
     def __init__(self, job: Job, writers: Sequence[KVWriter]):
         run, settings, chosen = job.run, job.settings, job.settings.hyperparameters
-        kwargs = {**chosen.algorithm_kwargs, "buffer_size": 1}
-        small = chosen.replace(noise=None, algorithm_kwargs=kwargs)
+        small = without_buffer(settings.algorithm, chosen.replace(noise=None))
         self.job, self.failure = job, ""
         env = DummyVecEnv([lambda: Spaces(run.task, job.encoder)])
         normalizing = normalized(env) if chosen.normalize else env

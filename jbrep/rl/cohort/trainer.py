@@ -63,14 +63,18 @@ def _begin(cohort: Cohort, snapshots: Sequence[Snapshot]) -> None:
 def _train(begun: list[_Begun], session: Session) -> Iterator[Ended]:
     cohort = Cohort([Member(job, session.writers) for job, _ in begun])
     everyone = cohort.members
+    others: list[Job] = []
     try:
         _begin(cohort, [snapshot for _, snapshot in begun if snapshot])
         begun.clear()  # a replay buffer can be large
         if not everyone[0].job.history.evaluations:
             cohort.evaluate()
         while cohort.goes_on:
-            yield from map(_end, cohort.failed)
-            cohort = cohort.survivors()
+            if cohort.failed:
+                yield from map(_end, cohort.failed)
+                cohort, snapshots = cohort.survivors()
+                cohort.restore(snapshots)
+                snapshots.clear()
             _tell(cohort, session)
             _save(cohort, session)
             for _ in range(cohort.rollout):
@@ -80,19 +84,19 @@ def _train(begun: list[_Begun], session: Session) -> Iterator[Ended]:
         _tell(cohort, session)  # the last evaluation can take minutes
         if session.keep_checkpoint:
             _write(cohort)
-        cohort.evaluate_finally()
+        cohort.evaluate(Job.final_evaluation)
         _tell(cohort, session)
         yield from map(_end, cohort.members)
     except EnvironmentFailedError as error:
-        cohort.close()
         cohort.member_of(error.lane).fail(str(error))
         yield from map(_end, cohort.failed)
-        others = [m.job.anew() for m in cohort.members if not m.failure]
-        yield from train_together(others, session)  # from their checkpoints
+        others = [member.job.anew() for member in cohort.members if not member.failure]
     finally:
         cohort.close()
         for member in everyone:
             member.agent.logger.close()
+    del cohort, everyone  # a replay buffer is as large as that of those which follow
+    yield from train_together(others, session)  # from their checkpoints
 
 
 def _tell(cohort: Cohort, session: Session) -> None:
