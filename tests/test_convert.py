@@ -211,7 +211,7 @@ def test_what_is_no_module_or_has_hooks_or_a_bad_name_is_refused():
     hooked.register_forward_hook(lambda module, given, result: result * 2)
     with pytest.raises(InputError, match="the hooks of Linear"):
         Encoder.from_torch(hooked, TASK)
-    with pytest.raises(InputError, match="function is no torch module"):
+    with pytest.raises(InputError, match="function isn't a torch module"):
         Encoder.from_torch(lambda x: x, TASK)
     with pytest.raises(InputError, match="name is 'My net': it must be lower-case"):
         Encoder.from_torch(nn.Linear(16, 3), TASK, name="My net")
@@ -387,8 +387,8 @@ def test_a_decoder_of_its_own(tmp_path):
             ),
             "reads x, from before the latent",
         ),
-        (("a = Relu x; y = Relu nothing",), "no ONNX model that can be read"),
-        (("y = Relu x; y = Relu x",), "no ONNX model that can be read"),
+        (("a = Relu x; y = Relu nothing",), "an ONNX model that can be read"),
+        (("y = Relu x; y = Relu x",), "an ONNX model that can be read"),
         (([node(f"y{i} = Relu x") for i in range(1001)],), "more than 1000 nodes"),
         (
             (f"y0 = MatMul x w; {DEEP}", {"w": f32(16, 4096)}, ("x", (1, 16)), "y9"),
@@ -432,7 +432,7 @@ def test_what_is_no_model_is_refused(kind, tmp_path):
     elif kind == "huge":
         with path.open("wb") as file:
             file.truncate(1 << 40)
-    with pytest.raises(InputError, match=r"no file|must be a regular file|no ONNX model"):
+    with pytest.raises(InputError, match=r"no file|must be a regular file|an ONNX model"):
         convert(path, TASK, None, "mine")
 
 
@@ -447,8 +447,8 @@ def test_what_is_no_model_is_refused(kind, tmp_path):
         ({"location": "missing"}, "no file"),
         ({"location": "weights", "offset": "-8"}, "doesn't fit"),
         ({"location": "weights", "length": "9999"}, "doesn't fit"),
-        ({"location": "weights", "length": "8"}, "no ONNX model that can be read"),
-        ({"location": "weights", "offset": "x"}, "no ONNX model that can be read"),
+        ({"location": "weights", "length": "8"}, "an ONNX model that can be read"),
+        ({"location": "weights", "offset": "x"}, "an ONNX model that can be read"),
     ],
     ids=str,
 )

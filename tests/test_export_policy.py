@@ -99,7 +99,7 @@ def test_mistakes_are_a_line(run, tmp_path):
     said = mistake(*exporting, tmp_path / "x", "--task", "face_direction")
     assert f"{run} has its own task: leave out --task" in said
     bad.write_bytes(b"no model")
-    assert "is no ONNX model that can be run: " in mistake(*checking, bad)
+    assert "isn't an ONNX model that can be run: " in mistake(*checking, bad)
     said = mistake(*checking, model, "--task", "face_direction")
     assert "takes 3 numbers and gives 1, but face_direction observes 16" in said
     changed = onnx.load(model)

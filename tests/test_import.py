@@ -578,8 +578,8 @@ def test_files_that_are_no_data_are_refused(tmp_path, minari_folder):
         "a.parquet": "can't be read as a Parquet file",
         "a.pkl": "unknown format '.pkl': choose one of npz, parquet",
         "no.npz": "there is no file",
-        "cut.npz": "is damaged: observations is no array",
-        "bits.npz": "is damaged: observations is no array, or has other bytes",
+        "cut.npz": "is damaged: observations isn't an array",
+        "bits.npz": "is damaged: observations isn't an array, or has other bytes",
         "names.npz": "has 3 features, and names of 1",
         "spoiled": "main_data.hdf5 can't be read as an HDF5 file",
     }.items():

@@ -240,7 +240,7 @@ def test_the_command_shows_what_a_policy_keeps(tmp_path):
     assert [row["name"] for row in one] == ["undisturbed", "delay=2"]
     assert one[1] == next(row for row in rows if row["name"] == "delay=2")
     assert "exists already" in mistake(*played, "--perturb", "--out", file)
-    assert "--perturb soon is no perturbation: write" in mistake(*played, "--perturb", "soon")
+    assert "--perturb soon isn't a perturbation: write" in mistake(*played, "--perturb", "soon")
     assert "--out is for the table of --perturb" in mistake(*played, "--out", tmp_path / "x")
 
 

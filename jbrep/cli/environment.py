@@ -135,7 +135,9 @@ def parse_arguments(given: tuple[str, ...], option: str = "--env") -> dict[str, 
     for pair in given:
         name, equals, value = pair.partition("=")
         if not equals or not name.isidentifier() or name in arguments:
-            raise InputError(f"{option} {pair} is no argument, or a second one: write NAME=VALUE")
+            raise InputError(
+                f"{option} {pair} isn't an argument, or a second one: write NAME=VALUE"
+            )
         try:
             arguments[name] = json.loads(value)
         except ValueError:

@@ -89,7 +89,7 @@ def _read(path: Path) -> tuple[onnx.ModelProto, Constants]:
     model's folder, never through a path or a link.
 
     Raises:
-        InputError: there is no such file, or it is no ONNX model that can be read.
+        InputError: there is no such file, or it isn't an ONNX model that can be read.
     """
     model = onnx.ModelProto()
     try:
@@ -103,7 +103,7 @@ def _read(path: Path) -> tuple[onnx.ModelProto, Constants]:
         raise
     except _UNREADABLE as error:
         reason = first_line(error)
-        raise InputError(f"{path} is no ONNX model that can be read: {reason}") from None
+        raise InputError(f"{path} isn't an ONNX model that can be read: {reason}") from None
 
 
 def _array(tensor: TensorProto) -> NDArray[np.generic]:
@@ -248,7 +248,7 @@ class _Node:
             raise InputError(f"it reads {name}, which is no output that can be used")
         constant = constants[name]
         if constant.dtype.kind not in "fib":
-            raise InputError(f"its input {name} is no number")
+            raise InputError(f"its input {name} isn't a number")
         return constant.astype(np.float64) if constant.dtype.kind == "f" else constant
 
     def constant(self) -> Any:

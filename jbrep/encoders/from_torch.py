@@ -56,7 +56,7 @@ def _layers(module: nn.Module, method: str, rows: Any) -> tuple[tuple[Layer, ...
     """
     said = type(module).__name__
     if not isinstance(module, nn.Module):
-        raise InputError(f"{said} is no torch module: an Encoder is made of one")
+        raise InputError(f"{said} isn't a torch module, of which an Encoder is made")
     try:
         copied = _copy(getattr(module, "_orig_mod", module))  # of a compiled one, the original
         traced = _Method(copied, method if hasattr(copied, method) else "forward")

@@ -167,7 +167,7 @@ def find_alone(name: Any, task: Task | None) -> BaseEncoder:
         return name
     if is_code(name) or not isinstance(name, (str, Path)):
         raise InputError(
-            f"{name} is no file, which would say whose observations it reads: give its --task, too"
+            f"{name} isn't a file, which would say what it observes: give its --task, too"
         )
     if not exists(name):
         raise InputError(f"no encoder at {name}: for one that ships, give its --task, too")

@@ -128,7 +128,7 @@ class ForwardObjective(Objective):
 
     At each horizon k a network of its own takes the code and the next k actions, and gives the
     change of each number of the row over k steps, its value then, and the mean reward until then,
-    all standardised. The loss is the sum of their weighted mean squared errors, meant over the
+    all standardised. The loss is the sum of their weighted mean squared errors, averaged over the
     horizons, and of that of the first action from the codes of now and of the next step.
 
     Units of the code are linear, whatever the architecture: with tanh, some saturate early in the
@@ -200,7 +200,7 @@ class ForwardObjective(Objective):
         yield from map(_Batch, *parts)
 
     def _errors(self, batch: _Batch, code: Tensor) -> Tensor:
-        """Squared errors from codes (n, l), meant over rows, (horizons, targets)."""
+        """Squared errors from codes (n, l), averaged over rows, (horizons, targets)."""
         predicted = self.predictors(torch.cat((code.T, batch.actions)))
         return (predicted - batch.targets).square().mean(2)
 

@@ -39,7 +39,8 @@ def read_exported(path: Path) -> tuple[Any, Described]:
     except InputError:
         raise
     except Exception as error:  # of several classes
-        raise DamageError(f"{path} is no ONNX model that can be run: {first_line(error)}") from None
+        said = first_line(error)
+        raise DamageError(f"{path} isn't an ONNX model that can be run: {said}") from None
     text = session.get_modelmeta().custom_metadata_map.get("jbrep", "")
     try:
         return session, msgspec.json.decode(text, type=Described)

@@ -71,8 +71,8 @@ def read_perturbation(text: str) -> dict[str, str]:
         name, equals, value = part.strip().partition("=")
         if not equals or name in given:
             raise InputError(
-                f"--perturb {text} is no perturbation: write {NAMES[0]}=0.1 or delay=1..3, several "
-                f"at once with commas; there are {', '.join(NAMES)}"
+                f"--perturb {text} isn't a perturbation: write {NAMES[0]}=0.1 or delay=1..3, "
+                f"several at once with commas; there are {', '.join(NAMES)}"
             )
         given[name] = value
     read_ranges(given)

@@ -128,7 +128,7 @@ def _checked(agent: BaseAlgorithm, task: Task, seen: BaseEncoder, path: Path) ->
 def _loaded(raw: bytes, path: Path, algorithm: str) -> tuple[BaseAlgorithm, ZipMetadata | None]:
     kind = sb3_class(algorithm)
     if not zipfile.is_zipfile(io.BytesIO(raw)):
-        raise InputError(f"{path} is no {algorithm} policy: it isn't a zip file")
+        raise InputError(f"{path} isn't a {algorithm} policy: it isn't a zip file")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of schedules that another Python pickled
@@ -143,7 +143,7 @@ def _loaded(raw: bytes, path: Path, algorithm: str) -> tuple[BaseAlgorithm, ZipM
     except InputError:
         raise
     except Exception as error:  # whatever its pickled parts do
-        raise InputError(f"{path} is no {algorithm} policy: {one_line(error)}") from None
+        raise InputError(f"{path} isn't a {algorithm} policy: {one_line(error)}") from None
 
 
 def _check_observations(space: spaces.Space[Any], seen: BaseEncoder, path: Path) -> None:

@@ -21,7 +21,7 @@ def table_of(frame: Any, name: str) -> Table:
         columns = dict(frame) if isinstance(frame, Mapping) else frame
         table = pa.table(columns).combine_chunks()
     except (TypeError, ValueError, pa.ArrowException) as error:
-        raise InputError(f"{name} is no table: {kind_and_line(error)}") from None
+        raise InputError(f"{name} isn't a table: {kind_and_line(error)}") from None
 
     def batches(names: list[str]) -> Iterator[pa.RecordBatch]:
         yield from table.select(names).to_batches(CHUNK)

@@ -80,8 +80,8 @@ def _opened(archive: zipfile.ZipFile, name: str) -> Iterator[_Stored]:
         raise
     except _DAMAGE:
         raise InputError(
-            f"{archive.filename} is damaged: {name} is no array, or has other bytes than its shape "
-            "and type say"
+            f"{archive.filename} is damaged: {name} isn't an array, or has other bytes than its "
+            "shape and type say"
         ) from None
 
 

@@ -275,7 +275,7 @@ def _losses(task: str, encoders: Encoders) -> Plot:
         "losses",
         f"{task}: loss in training and on held-out episodes",
         "The loss that each encoder was trained by, at its best epoch: open on the training part, "
-        "filled on held-out episodes. Where they part, the network knows its data by heart. Losses "
+        "filled on held-out episodes. Where they diverge, the network overfits. Losses "
         "of different methods can't be compared.",
         ("encoder", *_LOSSES),
         [(label, *(e.method[loss] for loss in _LOSSES)) for label, e in encoders.items()],

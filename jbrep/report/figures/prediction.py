@@ -124,7 +124,7 @@ def _by_horizon(task: str, encoders: Encoders) -> Plot:
     return Plot(
         "prediction_by_horizon",
         f"{task}: prediction by steps ahead",
-        "R² of the changes over so many steps, meant over features, and of the mean reward over "
+        "R² of the changes over so many steps, averaged over features, and of the mean reward over "
         "them, predicted from the code and the actions taken meanwhile, on held-out episodes; "
         "bars: 95 % intervals over episodes.",
         _COLUMNS,
