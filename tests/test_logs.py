@@ -404,7 +404,7 @@ def test_what_is_exported_to_lerobot_has_its_layout_and_comes_back(tmp_path):
         tmp_path / "unknown", {"x": [0.0, 1, 2], "action": [0.5] * 3}, Layout(length=9)
     )
     done = jbrep("data", "export", unknown.folder, "--to", "lerobot", "--out", tmp_path / "no")
-    assert "the time step of unknown is not known: give it as timestep" in done.output
+    assert "the time step of table is not known: give it as timestep" in done.output
 
 
 def test_damaged_lerobot_data_sets_are_refused(tmp_path):
@@ -413,7 +413,7 @@ def test_damaged_lerobot_data_sets_are_refused(tmp_path):
     assert "layout v4.0: it must be v3.0 or v2.1" in done.output
     (folder / "meta/info.json").write_text("{}")
     done = jbrep("data", "import", folder, "--out", tmp_path / "out")
-    assert "isn't as LeRobot writes it: KeyError('codebase_version')" in done.output
+    assert "isn't as LeRobot writes it: KeyError: 'codebase_version'" in done.output
     shutil.rmtree(folder / "data")
     (folder / "meta/info.json").write_text(
         json.dumps({"codebase_version": "v3.0", "fps": 30, "features": {}})
