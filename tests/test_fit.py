@@ -248,9 +248,13 @@ def test_training_from_disk_takes_little_memory(tmp_path, monkeypatch):
 
 def test_half_of_the_free_memory_is_taken_but_at_least_a_gibibyte(monkeypatch):
     for free, taken in ((8 << 30, 4 << 30), (1 << 20, 1 << 30)):
-        sizes = {"SC_AVPHYS_PAGES": free >> 12, "SC_PAGE_SIZE": 1 << 12}
-        monkeypatch.setattr("os.sysconf", sizes.__getitem__)
+        told = f"MemTotal: {1 << 40} kB\nMemFree: 7 kB\nMemAvailable: {free >> 10} kB\n"
+        monkeypatch.setattr(Path, "read_text", lambda path, told=told: told)
         assert available_memory(torch.device("cpu")) == taken
+    monkeypatch.setattr(Path, "read_text", lambda path: "")  # of another system
+    sizes = {"SC_PHYS_PAGES": 1 << 22, "SC_PAGE_SIZE": 1 << 12}
+    monkeypatch.setattr("os.sysconf", sizes.__getitem__)
+    assert available_memory(torch.device("cpu")) == 8 << 30
 
 
 def test_fewer_held_out_rows_of_a_wide_robot_are_watched(monkeypatch):

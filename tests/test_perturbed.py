@@ -314,7 +314,7 @@ def test_the_command_trains_with_ranges(tmp_path):
     domain = read_run(tmp_path / "run").settings.environment.domain
     assert domain == Domain(delay=(0, 2), dropped=(0, 0.5))
     assert "friction can't be changed in Pendulum-v1" in mistake(*run, "--domain", "friction=2")
-    assert "--domain delay is no argument" in mistake(*run, "--domain", "delay")
+    assert "--domain delay isn't an argument" in mistake(*run, "--domain", "delay")
     another = mistake(*run, *small)
     assert "holds another run: domain delay=0..2,dropped=0..0.5 (now: none), encoder" in another
 

@@ -331,10 +331,9 @@ def test_a_rare_reward_is_learnt_beside_many_features(monkeypatch):
     moved = np.sin(2 * seen @ random.normal(size=(6, 20)))
     wanted = np.column_stack((moved, near)).astype(np.float32)
     steps = Steps(np.arange(20_000), seen, np.zeros((20_000, 1)), wanted)
-    monkeypatch.setattr("jbrep.evaluate.prediction.following", lambda *_: steps)
     monkeypatch.setattr("jbrep.evaluate.prediction.usual_horizons", lambda _: [10])
     alone = SimpleNamespace(encode=lambda rows: rows)
-    (pair,) = problems(alone, SimpleNamespace(data=None)).values()
+    (pair,) = problems(alone, SimpleNamespace(data=None, once=lambda *_: steps)).values()
     together = Problem(steps.inputs(alone), wanted)
     *apart, joint = fit([*pair, together])
     told = [r2_score(near, each(together.values)[:, -1]) for each in (beside(*apart), joint)]

@@ -489,7 +489,7 @@ def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
         load_zip(path, TASK, "sac", "dae-8", trust=False)
     assert load_zip(path, TASK, "sac", "dae-8", trust=True).trained.task == TASK
     for algorithm, encoder in (("sac", "dae-4"), ("ppo", "dae-8"), ("fly", "dae-8")):
-        with pytest.raises(InputError, match=r"is no|unknown algorithm|observes 8 numbers"):
+        with pytest.raises(InputError, match=r"isn't a|unknown algorithm|observes 8 numbers"):
             load_zip(path, TASK, algorithm, encoder, trust=True)
 
 

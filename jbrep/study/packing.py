@@ -86,7 +86,7 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
 def _most(plan: Plan, cell: Cell, observed: int, workers: int) -> int:
     """How many runs like this one memory holds, for each worker."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") * _SHARE
-    of_each = 2 * memory_of(plan.run(cell), observed)  # resumed, it has its checkpoint, too
+    of_each = memory_of(plan.run(cell), observed)
     return int((memory / workers - _OF_WORKER) // (of_each + _OF_AGENT))
 
 

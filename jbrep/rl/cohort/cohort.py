@@ -256,14 +256,17 @@ class Cohort:
         return Snapshot(tensors, {**counters, "added": self._replay.added})
 
     def restore(self, snapshots: Sequence[Snapshot]) -> None:
-        """Continue from where snapshots of all members were taken, at the same step."""
+        """Continue from where snapshots of all members were taken, at the same step.
+
+        They lose their replay buffers: memory is enough for one replay buffer of each member.
+        """
         for member, snapshot in zip(self.members, snapshots, strict=True):
             member.restore(snapshot)
         self._stack.read_from_agents()
         self.agent_step, self._n_updates = self._shared.num_timesteps, self._shared._n_updates
         tensors = [each.tensors for each in snapshots]
         self._observation = np.stack([each["observation"] for each in tensors])
-        self._replay.restore([each["replay"] for each in tensors], snapshots[0].counters["added"])
+        self._replay.restore((e.pop("replay") for e in tensors), snapshots[0].counters["added"])
         lanes = [without(LANES, each) for each in tensors]
         self._robots.restore({n: joined([each[n] for each in lanes]) for n in lanes[0]})
 

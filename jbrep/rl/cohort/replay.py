@@ -1,6 +1,6 @@
 """Replay buffers of n agents."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +75,7 @@ class ReplayBuffer:
         """What is there of an agent, (filled, lanes, width); a view."""
         return self._rows[agent, : self.filled]
 
-    def restore(self, rows: Sequence[Float32], added: int) -> None:
+    def restore(self, rows: Iterable[Float32], added: int) -> None:
         """Put back what `rows_of` gave of each agent, after so many steps had been added."""
         self.added = added
         for agent, each in enumerate(rows):

@@ -66,7 +66,6 @@ def _train(begun: list[_Begun], session: Session) -> Iterator[Ended]:
     others: list[Job] = []
     try:
         _begin(cohort, [snapshot for _, snapshot in begun if snapshot])
-        begun.clear()  # a replay buffer can be large
         if not everyone[0].job.history.evaluations:
             cohort.evaluate()
         while cohort.goes_on:
@@ -74,7 +73,6 @@ def _train(begun: list[_Begun], session: Session) -> Iterator[Ended]:
                 yield from map(_end, cohort.failed)
                 cohort, snapshots = cohort.survivors()
                 cohort.restore(snapshots)
-                snapshots.clear()
             _tell(cohort, session)
             _save(cohort, session)
             for _ in range(cohort.rollout):
