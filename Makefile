@@ -145,7 +145,7 @@ programme-time: $(READY) ## how long that takes here, without what has ended
 	for study in $(PROGRAMME); do $(BIN)/jbrep study studies/$$study.toml --dry-run --out runs/$$study || exit; done
 
 # whether scores tell which codes serve: scored as soon as they are registered, before agents train on them
-worth: $(filter worth-%,$(STUDIES)) ## how well they do: six hours; goes on where it was stopped
+worth: $(filter worth-%,$(STUDIES)) ## how well they do: seven hours; goes on where it was stopped
 	$(BIN)/python tools/worth.py $(addprefix results/,$^)
 $(SCORED): scored-%: $(READY)
 	test -e runs/$*/registration.json || $(BIN)/jbrep study studies/$*.toml --register --out runs/$*
