@@ -45,8 +45,8 @@ class Encoded:
     It is a `gymnasium.Wrapper` of a single environment, a `gymnasium.vector.VectorWrapper` of a
     vector environment. The encoder gets float32 observations in physical units, (n, d), flat in the
     order of Gymnasium's `flatten`, less the task's offsets; of a vector environment all lanes at
-    once. Where a vector
-    environment resets in the step that ends an episode, `infos["final_obs"]` holds latents, too.
+    once. Where a vector environment resets in the step that ends an episode, `infos["final_obs"]`
+    holds latents, too.
 
     Args:
         env: the environment.

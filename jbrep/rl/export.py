@@ -53,9 +53,9 @@ def described(controller: Controller) -> dict[str, Any]:
                 "unit": each.unit,
                 "low": each.low,
                 "high": each.high,
-                "offset": (task.offsets or {}).get(each.name, 0.0),  # subtracted beforehand
+                "offset": offset,  # subtracted beforehand
             }
-            for each in now
+            for each, offset in zip(now, task.offset.tolist(), strict=False)
         ],
         "action": {"low": to_plain(task.action_low), "high": to_plain(task.action_high)},
         # of so many states, the newest first, then of the actions between, the input consists
