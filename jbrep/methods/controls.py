@@ -85,7 +85,7 @@ class Noise(Coded, ClosedForm, frozen=True, kw_only=True):
     """
 
     name: ClassVar[str] = "noise"
-    fewer: ClassVar[int | None] = None
+    min_reduction: ClassVar[int | None] = None
 
     seed: Seed = 0
 

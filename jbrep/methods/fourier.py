@@ -15,7 +15,7 @@ class Fourier(Coded, ClosedForm, frozen=True, kw_only=True):
     """Sines of random directions, in which functions of the observation are nearly linear."""
 
     name: ClassVar[str] = "fourier"
-    fewer: ClassVar[int | None] = None
+    min_reduction: ClassVar[int | None] = None
 
     frequency: Annotated[
         float,

@@ -126,7 +126,7 @@ class PCA(Coded, ClosedForm, frozen=True, kw_only=True):
     """The first l principal components: of all linear codes, the least error."""
 
     name: ClassVar[str] = "pca"
-    fewer: ClassVar[int | None] = 0
+    min_reduction: ClassVar[int | None] = 0
 
     def make(self, data: ScaledDataset) -> Made:
         """As for `ClosedForm`."""
@@ -136,7 +136,7 @@ class PCA(Coded, ClosedForm, frozen=True, kw_only=True):
 class Directions(Coded, ClosedForm, frozen=True, kw_only=True):
     """A method whose units are directions: of features that vary, at most as many as those."""
 
-    fewer: ClassVar[int | None] = 0
+    min_reduction: ClassVar[int | None] = 0
 
     def check_data(self, data: ScaledDataset) -> None:
         """As for `Method`."""

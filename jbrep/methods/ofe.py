@@ -24,7 +24,7 @@ class OFE(Learned, frozen=True, kw_only=True):
     """The observation with features beside it, from which the next one follows (OFENet)."""
 
     name: ClassVar[str] = "ofe"
-    fewer: ClassVar[int | None] = None
+    min_reduction: ClassVar[int | None] = None
 
     blocks: Annotated[
         int, Meta(ge=1, le=32, description="Layers, each of which sees all that come before.")

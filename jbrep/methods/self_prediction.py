@@ -51,7 +51,7 @@ class SelfPredictionObjective(Objective):
     """
 
     horizon = 1
-    moves = True
+    moving_target = True
 
     def __init__(self, method: SelfPrediction, data: ScaledDataset):
         super().__init__()

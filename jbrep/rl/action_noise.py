@@ -10,7 +10,7 @@ from stable_baselines3.common.noise import ActionNoise
 from jbrep.envs.task import Array
 
 
-class RememberedNoise(ActionNoise):
+class StatefulNoise(ActionNoise):
     """Noise in one lane, drawn from the generator that stable-baselines3 draws from.
 
     Args:

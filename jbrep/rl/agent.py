@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.distributions import Distribution
 
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.vec_env import JitterbugVecEnv, agent_spaces
+from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import Actor, Outcome, held, joined, whole_outcome
 from jbrep.envs.task import Array, Task
@@ -74,8 +74,8 @@ def one_line(told: object) -> str:
 class Spaces(gymnasium.Env[Any, Any]):
     """What a policy needs to know of a task to be built, without making the environment."""
 
-    def __init__(self, task: Task, encoder: BaseEncoder):
-        self.observation_space, self.action_space = agent_spaces(task, encoder)
+    def __init__(self, observation_space: spaces.Box, action_space: spaces.Box):
+        self.observation_space, self.action_space = observation_space, action_space
 
 
 def training_seed(seed: int) -> int:

@@ -83,9 +83,9 @@ class ColouredNoise(Record, frozen=True, tag_field="kind", tag="coloured"):
 
     def make(self, size: int, steps: int) -> "ActionNoise":
         """As for `NormalNoise`."""
-        from jbrep.rl.action_noise import RememberedNoise
+        from jbrep.rl.action_noise import StatefulNoise
 
-        return RememberedNoise(partial(self._next, steps=steps), size)
+        return StatefulNoise(partial(self._next, steps=steps), size)
 
     def after(self, memory: Memory, steps: int, generator: np.random.RandomState) -> Memory:
         """As for `NormalNoise`."""

@@ -9,7 +9,6 @@ from difflib import get_close_matches
 from functools import cache
 from typing import Annotated, Any, Literal
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 from msgspec import Meta
@@ -18,10 +17,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from jbrep.errors import InputError
 from jbrep.records.record import converted, shown, to_plain
-from jbrep.rl.agent import ACTIVATIONS, global_random_state_kept, make_agent, one_line
+from jbrep.rl.agent import ACTIVATIONS, Spaces, global_random_state_kept, make_agent, one_line
 from jbrep.rl.presets import Hyperparameters, NetArch, get_preset, parameters_of, sb3_class
 
 _MOST = 10**9  # of any number
+_ANY_SPACES = (spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-1, 1, (1,), np.float32))
 _RANGES: dict[str, tuple[float, float]] = {  # others: from 1 if whole, else from 0
     **dict.fromkeys(("gamma", "tau", "gae_lambda", "batch_norm_momentum"), (0, 1)),
     **dict.fromkeys(("gradient_steps", "sde_sample_freq"), (-1, _MOST)),
@@ -240,20 +240,14 @@ def _check_together(chosen: Hyperparameters) -> None:
         )
 
 
-class _Body(gymnasium.Env[Any, Any]):
-    """A task's spaces, whatever the task."""
-
-    observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
-    action_space = spaces.Box(-1, 1, (1,), np.float32)
-
-
 def _build(algorithm: str, chosen: Hyperparameters) -> None:
     """Build an agent, so that what stable-baselines3 refuses is known before the first step."""
     small = without_buffer(algorithm, chosen)
     try:
         with warnings.catch_warnings(), global_random_state_kept():
             warnings.simplefilter("ignore")  # training gives them
-            make_agent(algorithm, small, DummyVecEnv([_Body] * chosen.num_envs), 0)
+            env = DummyVecEnv([lambda: Spaces(*_ANY_SPACES)] * chosen.num_envs)
+            make_agent(algorithm, small, env, 0)
     except Exception as error:  # stable-baselines3's own checks raise many types
         raise InputError(
             f"stable-baselines3 can't make {algorithm} with these settings: {one_line(error)}"

@@ -21,7 +21,7 @@ from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
 from jbrep.records.container import Tensors, without
 from jbrep.rl import checkpoint
-from jbrep.rl.action_noise import RememberedNoise
+from jbrep.rl.action_noise import StatefulNoise
 from jbrep.rl.agent import make_agent, make_env, training_seed, unchecked_distributions
 from jbrep.rl.checkpoint import (
     ACTIONS_NOT_FINITE,
@@ -37,7 +37,7 @@ from jbrep.rl.trained import acting
 
 _MEMORIES: dict[type, str] = {  # of noises that depend on what was drawn before
     OrnsteinUhlenbeckActionNoise: "noise_prev",
-    RememberedNoise: "memory",
+    StatefulNoise: "memory",
 }
 _UNSCALED = "_last_original_obs"  # before it was normalised
 _EXPLORATION = ("exploration_mat", "exploration_matrices")

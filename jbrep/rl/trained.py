@@ -11,6 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.vec_env import agent_spaces
 from jbrep.envs.recording import Actor, held
 from jbrep.envs.task import Array, Task
 from jbrep.errors import DamageError, InputError
@@ -129,7 +130,8 @@ def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
     small = without_buffer(settings.algorithm, shape)
     try:
         with global_random_state_kept():
-            agent = make_agent(settings.algorithm, small, Spaces(task, encoder), settings.seed)
+            spaces = Spaces(*agent_spaces(task, encoder))
+            agent = make_agent(settings.algorithm, small, spaces, settings.seed)
     except (AssertionError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"no policy can be made from the settings of the run: {one_line(error)}"

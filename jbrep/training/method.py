@@ -45,7 +45,7 @@ class Method(Record, frozen=True, kw_only=True):
 
     name: ClassVar[str]
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # named sets of settings
-    fewer: ClassVar[int | None] = None  # than features its code must have; None if any size will do
+    min_reduction: ClassVar[int | None] = None  # of features to numbers; None: any size will do
 
     scaling: Scaling = "extrema"
     on: On = "observation"
@@ -105,7 +105,7 @@ class Method(Record, frozen=True, kw_only=True):
     @classmethod
     def largest(cls, size: int) -> int | None:
         """The largest latent size for an observation of `size` features; None if any will do."""
-        return None if cls.fewer is None else size - cls.fewer
+        return None if cls.min_reduction is None else size - cls.min_reduction
 
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
@@ -143,7 +143,7 @@ class Method(Record, frozen=True, kw_only=True):
 class Coded(Method, frozen=True, kw_only=True):
     """A method with a code of its own size."""
 
-    fewer: ClassVar[int | None] = 1
+    min_reduction: ClassVar[int | None] = 1
 
     latent: Latent
     keep: Keep = ()

@@ -23,13 +23,13 @@ class Objective(nn.Module, ABC):
     Attributes:
         encoder: gives the code.
         horizon: steps that a window reaches ahead.
-        moves: whether the loss is against a target that learns as well, so that losses of different
-            epochs can't be compared: the last epoch is kept then, not the one of least loss.
+        moving_target: whether the loss is against a target that learns as well, so that losses of
+            different epochs can't be compared: the last epoch is kept then, not that of least loss.
     """
 
     encoder: nn.Sequential
     horizon: int = 0
-    moves: bool = False
+    moving_target: bool = False
 
     def prepare(self, windows: Windows) -> None:
         """Fit what is constant in training, such as scales of targets, to training windows."""

@@ -111,7 +111,7 @@ class Trainer:
     @property
     def best_epoch(self) -> int:
         """The epoch whose parameters are kept, from 1; 0 before the first."""
-        if self.objective.moves or not self.history:
+        if self.objective.moving_target or not self.history:
             return len(self.history)
         losses = [epoch.train_loss for epoch in self.history]
         return losses.index(min(losses)) + 1

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jbrep.encoders import find, save
+from jbrep.encoders.vec_env import agent_spaces
 from jbrep.records.tables import write_rows
 from jbrep.report.figures.style import PAPER
 from jbrep.rl.agent import Spaces, make_agent, parameters
@@ -138,7 +139,8 @@ def write_checkpoint(folder, run, step):
     """A run under way at that step, with the policy that it began with; returns its agent."""
     encoder = find(run.encoder, run.task)
     shape = check_shape(run.learner.algorithm, run.learner.hyperparameters)
-    agent = make_agent(run.learner.algorithm, shape, Spaces(run.task, encoder), run.seed)
+    spaces = Spaces(*agent_spaces(run.task, encoder))
+    agent = make_agent(run.learner.algorithm, shape, spaces, run.seed)
     tensors = {f"parameters.{name}": each.numpy() for name, each in parameters(agent)}
     file = CheckpointFile(folder / CHECKPOINT, run.settings(encoder), packages(), History())
     file.write(Snapshot(tensors, {"num_timesteps": step}))

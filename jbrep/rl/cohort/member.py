@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import Tensor
 
 from jbrep.encoders.base import Float32
+from jbrep.encoders.vec_env import agent_spaces
 from jbrep.envs.lanes import EnvironmentFailedError, Flags, NonFiniteActionError
 from jbrep.envs.task import Array
 from jbrep.records.container import Tensors, without
@@ -54,7 +55,7 @@ class Member:
         run, settings, chosen = job.run, job.settings, job.settings.hyperparameters
         small = without_buffer(settings.algorithm, chosen.replace(noise=None))
         self.job, self.failure = job, ""
-        env = DummyVecEnv([lambda: Spaces(run.task, job.encoder)])
+        env = DummyVecEnv([lambda: Spaces(*agent_spaces(run.task, job.encoder))])
         normalizing = normalized(env) if chosen.normalize else env
         self.agent: Any = make_agent(settings.algorithm, small, normalizing, run.seed)
         self._normalizer: VecNormalize | None = self.agent.get_vec_normalize_env()
