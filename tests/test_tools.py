@@ -179,7 +179,10 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         "a short run": ["-1.00", "-1.00", "0.00", "0.00"],
         "a whole run": ["1.00", "1.00", "2.00", "2.00"],
     }
-    assert lines[-1][0].endswith("and clearly above both others: it is so")
+    assert lines[8][0].endswith("and clearly above both others: it is so")
+    assert lines[12] == ["code", "rewarded", "trees", "a short run", "a whole run", "final return"]
+    assert lines[13] == ["slow-8", "-40", "1,600", "-40", "40", "40"]
+    assert [line[0] for line in lines[13:]] == ["slow-8", "dae-8", "pca-8", "vae-8", "ofe-64"]
     returns[:] = [r for r in returns if (r.representation, r.seed, r.step) != ("dae-8", 0, 60_000)]
     worth.main("study")  # of a run that failed before: it counts as -1, above -10 to -40 and -9
     lines = capsys.readouterr().out.splitlines()

@@ -8,7 +8,8 @@ most that one of them can say.
 
 Printed is Spearman's correlation in each task, and its mean over tasks with a 95 % interval over
 families of codes, and by how much that is above *rewarded* and above the short run. What was hoped
-for was written down before the first run: see PRIMARY.
+for was written down before the first run: see PRIMARY. Then, for each task, what was said of every
+code and what its agents returned.
 """
 
 import sys
@@ -27,7 +28,7 @@ from jbrep.report.tables import Tables, read_tables
 from jbrep.stats.association import difference, mean_rank_correlation
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.study.tables import by_run
-from jbrep.text import Table, interval
+from jbrep.text import SIGNIFICANT, Table, interval, number
 
 SCORES = "scores"
 REWARDED, SHORT, WHOLE = "rewarded", "a short run", "a whole run"
@@ -127,6 +128,16 @@ def check(evaluation: Evaluation, tables: Tables) -> None:
             raise InputError(f"{run.label}: agents trained on another code than the one scored")
 
 
+def by_code(task: Scored) -> Table:
+    """What was said of every code, beside the mean final return of its runs, the best first."""
+    said = {name: np.mean([each for each, _ in pairs], 0) for name, pairs in task.pairs.items()}
+    said["final return"] = np.mean([others for _, others in task.pairs[WHOLE]], 0)
+    cells = {name: [number(each, SIGNIFICANT) for each in values] for name, values in said.items()}
+    order = np.argsort(-said["final return"], kind="stable")
+    rows = [(task.codes[i], *(of_codes[i] for of_codes in cells.values())) for i in order]
+    return Table(f"{task.task}: scores and mean returns", ("code", *cells), rows)
+
+
 def main(*folders: str) -> None:
     if not folders:
         raise SystemExit(__doc__)
@@ -161,6 +172,8 @@ def main(*folders: str) -> None:
         f"\nHoped for: by {PRIMARY} at least {LEAST} on average, above {LEAST_LOW} at the low end, "
         f"and clearly above both others: {'it is so' if holds else 'it is not so'}"
     )
+    for each in tasks:
+        print(f"\n{by_code(each).text()}")
 
 
 if __name__ == "__main__":
