@@ -72,8 +72,8 @@ def plan(task: JitterbugTask, seed: int, copies: int, horizon: int, held: int) -
     began, robot = time.process_time(), Simulation(task, 1, 1)
     robot.reset([0], [np.random.default_rng(seed)])
     planner, planned = Planner(task, copies, horizon, seed), 0.0
-    for _ in range(0, EPISODE_STEPS, held):
-        for drive in planner.drives(robot.state, held):
+    for step in range(0, EPISODE_STEPS, held):
+        for drive in planner.drives(robot.state, held)[: EPISODE_STEPS - step]:
             robot.step(np.array([[drive]]))
             planned += float(robot.reward()[0])
     seconds, written = time.process_time() - began, 0.0

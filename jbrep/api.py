@@ -275,7 +275,9 @@ def evaluate(
     from jbrep.evaluate.diagnosis import diagnose, write  # imports torch
     from jbrep.play.sources import find_good_policy
 
-    found, good = find_all(encoders, scaled.task), find_good_policy(policy, scaled.task)
+    own_rewards = bool(scaled.dataset.manifest.settings.reward)
+    found = find_all(encoders, scaled.task)
+    good = find_good_policy(policy, scaled.task, own_rewards)
     whole = Dataset(truth) if isinstance(truth, str | Path) else truth
     if out is None:
         return Judged(diagnose(found, scaled, good, whole))

@@ -175,7 +175,7 @@ def number(value: float | None, form: str) -> str:
     """A number in that format, or a dash for None."""
     if value is None:
         return "-"
-    if form == SIGNIFICANT and abs(value) >= 1000:
+    if form == SIGNIFICANT and abs(value) >= 999.5:
         form = ",.0f"  # 1,190, not 1.19e+03
     return format(value, f"z{form}")  # no negative zero
 

@@ -173,6 +173,7 @@ MISTAKES = {
     "data repair none": "no data set in none",
     "data derive none --task fly --out x": "no data set in none",
     "data export none --to npz --out x": "no data set in none",
+    "study none --dry-run --register": "--dry-run and --register exclude each other: choose one",
     "data fly": "No such command 'fly'. See jbrep data --help.",
     "render uniform --size 640 --out x.gif": "write it as 640x480. See jbrep render --help.",
     "evaluate-policy none": "no policy at none: a folder of jbrep rl is needed",
@@ -309,13 +310,14 @@ def test_a_data_set_from_collecting_to_exporting(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "steps"), [("1500", 1500), ("1_000", 1000), ("2k", 2000), ("1e3", 1000), ("5M", 5e6)]
+    ("text", "steps"),
+    [("1500", 1500), ("1_000", 1000), ("2k", 2000), ("1e3", 1000), ("5M", 5e6), ("1.005k", 1005)],
 )
 def test_steps_may_be_written_in_many_ways(text, steps):
     assert COUNT.convert(text, None, None) == steps
 
 
-@pytest.mark.parametrize("text", ["many", "1.5", "k", "1e999", "nan"])
+@pytest.mark.parametrize("text", ["many", "1.5", "k", "1e999", "nan", 5000 * "9"])
 def test_steps_that_are_no_number_are_refused(text, tmp_path):
     result = jbrep("collect", "--task", "move_to_pose", "--steps", text, "--out", tmp_path / "x")
     assert result.exit_code == 2

@@ -12,6 +12,7 @@ from jbrep.envs.description import describe
 from jbrep.envs.lanes import Lanes
 from jbrep.errors import InputError
 from jbrep.play.sources import find_player
+from jbrep.records import container
 from jbrep.rl import Run, train
 from jbrep.rl.controller import Controller, load_policy
 from jbrep.rl.normalization import Statistics
@@ -155,6 +156,16 @@ def test_a_policy_that_sees_less_takes_no_more(history):
     ):  # the whole reading, of which it would take the first two
         with pytest.raises(InputError, match="numbers observed: it takes 2, of obs_1, obs_2"):
             controller(wrong)
+
+
+def test_what_a_policy_lacks_is_named(tmp_path):
+    shipped = find_shipped(describe("face_direction"))
+    tensors, header = container.read(shipped, "policy")
+    del tensors["policy.mu.bias"]
+    path = tmp_path / "policy.safetensors"
+    container.write(path, tensors, header)
+    with pytest.raises(InputError, match="doesn't fit the run's settings: it has no 'mu"):
+        load_policy(path)
 
 
 def test_what_it_cannot_act_on_is_refused():

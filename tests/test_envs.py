@@ -228,6 +228,8 @@ def test_frames_need_neither_a_display_nor_a_setting():
 
 
 def test_a_window_without_a_display_is_refused_in_one_line():
+    with pytest.raises(InputError, match="unknown camera 'side': choose one of overhead"):
+        gymnasium.make(FACE, camera="side")
     done = without_a_display(f"gymnasium.make('{FACE}', render_mode='human')")
     assert done.returncode == 1  # an abort of the process has another
     assert done.stderr.splitlines()[-1] == (

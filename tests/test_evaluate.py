@@ -490,12 +490,24 @@ def still_height(data, rows):
     return observation
 
 
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
 def test_labels_and_numbers_that_cannot_be_judged(data):
     with pytest.raises(InputError, match="the label full is reserved for the observation itself"):
         diagnose({"full": make(data, ((), ()))}, data)
     huge = Layer(np.full((16, 16), 1e11, np.float32), np.zeros(16, np.float32), "linear")
     with pytest.raises(InputError, match="it gives numbers that are not finite"):
         diagnose({"it": make(data, ((), (huge,) * 4))}, data)
+    rows = sample(data.test, 1000)  # that are looked at first
+    scaled = data.scaler.scale(data.dataset["observation"][np.concatenate((rows, data.train))])
+    heights = scaled[:, 2]
+    among_first = heights[: len(rows)].max()
+    assert heights.max() > among_first
+    weight = np.zeros((16, 16), np.float32)
+    weight[0, 2] = 1
+    only_above = Layer(weight, np.full(16, -among_first, np.float32), "relu")
+    rare = make(data, ((only_above, *(huge,) * 4), ()))
+    with pytest.raises(InputError, match="it gives numbers that are not finite"):
+        diagnose({"it": rare}, data)
 
 
 def test_an_evaluation_is_one_file_and_repeats(data, tmp_path):
@@ -511,6 +523,12 @@ def test_an_evaluation_is_one_file_and_repeats(data, tmp_path):
     with pytest.raises(InputError, match="is not an evaluation of these encoders"):
         write({"r-4": encoders["r-4"]}, data, tmp_path / "it")
     assert path.read_text() == text
+    one.replace(policy="runs/[1  2]").write(path)
+    assert read_document(path, Evaluation).policy == "runs/[1  2]"
+    path.write_text(text[:-20])
+    with pytest.raises(InputError, match="is damaged"):
+        write(encoders, data, tmp_path / "it")
+    path.write_text(text)
     assert "nan" not in evaluation_text(there)
 
 

@@ -167,6 +167,7 @@ def test_what_does_not_fit_is_named_in_one_line(tmp_path):
     assert "add --trust if you know who made it" in mistake(*untrusted)
     by_name = ("evaluate-policy", "uniform", "--vecnormalize", statistics)
     assert "--vecnormalize is for zip files" in mistake(*by_name)
+    assert "--trust is for zip files from elsewhere" in mistake(*by_name[:2], "--trust")
     PPO("MlpPolicy", Driven(gymnasium.make("Pendulum-v1"), 1000, 2000), device="cpu").save(path)
     assert "where Pendulum-v1 acts from -2 to 2: its bounds must be these, or -1 to 1" in (
         mistake(*given, "Pendulum-v1")

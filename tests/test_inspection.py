@@ -888,3 +888,13 @@ def test_the_viewer_ends_with_jbrep(number, viewer, brief, tmp_path):
         assert wait_for(told.exists, process)
         process.send_signal(number)
     wait_for_the_end_of([json.loads(told.read_text())[0]], seconds=30)
+
+
+def test_a_robot_whose_features_were_renamed_is_shown(tmp_path):
+    names = [*map("sensor_{}".format, range(16))]
+    renamed = tmp_path / "names.toml"
+    renamed.write_text("".join(f'[[features]]\nname = "{name}"\n' for name in names))
+    task = ("--task", "face_direction", "--features", renamed)
+    out = tmp_path / "shown.rrd"
+    assert jbrep("inspect", "heuristic", *task, "--encoder", "full", "--out", out).exit_code == 0
+    assert out.exists()

@@ -20,6 +20,7 @@ from small import adopt, forge
 
 from jbrep.encoders import find, save
 from jbrep.envs import describe
+from jbrep.envs.view import with_view
 from jbrep.errors import InputError
 from jbrep.evaluate.table import DIAGNOSTICS, SCALARS, Diagnosed, write_diagnostics
 from jbrep.play.sources import find_episode
@@ -443,6 +444,19 @@ def test_runs_without_a_study_are_made_again_each_in_a_folder_of_its_own(whole):
     assert sorted(folders) == sorted(
         f"a-study/{label.replace('dm_control/', 'dm_control-')}/seed-0" for label in cheetah
     )
+
+
+def test_a_run_that_saw_less_is_made_again_with_as_little(whole):
+    tables = read_tables(whole)
+    label, shared = next(iter(tables.record.labels.items()))
+    seen = with_view(describe("face_direction"), ["velocity_*"], 2).replace(missing="skip")
+    settings = shared.settings.replace(task=seen.name, environment=seen)
+    labels = {**tables.record.labels, label: shared.replace(settings=settings)}
+    record = tables.record.replace(labels=labels, study=None)
+    code = [code for _, code in reproduce(tables._replace(record=record))][1]
+    hidden = " ".join(f"--hide velocity_{axis}" for axis in "xyz")
+    assert "--task face_direction --" in code
+    assert f"{hidden} --history 2 --missing skip" in code
 
 
 def test_no_line_to_copy_runs_what_a_stranger_wrote(whole, tmp_path):

@@ -282,6 +282,11 @@ def test_a_run_that_was_stopped_can_go_on_with_more_steps(tmp_path):
     job = Job(Run.of(CART, steps=400_000, **settings), tmp_path)
     assert job.settings.evaluate_every == 20_000
     assert job.checkpoint.read()
+    with pytest.raises(StoppedError):
+        train(Run.of(CART, steps=400_000, **settings), tmp_path, Session(stop=lambda: True))
+    again = Job(Run.of(CART, steps=400_000, **settings), tmp_path)  # the same command
+    assert again.settings.evaluate_every == 20_000
+    assert again.checkpoint.read()
 
 
 @pytest.mark.parametrize("normalize", [False, True])

@@ -19,9 +19,12 @@ from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.verify import find_problems
 from jbrep.encoders.wrapper import Encoded
 from jbrep.envs import Lanes, describe, instances
+from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.make import make_env
 from jbrep.envs.names import import_modules
-from jbrep.errors import InputError
+from jbrep.envs.recording import whole_outcome
+from jbrep.envs.separate import Retries
+from jbrep.errors import InputError, Notice
 from jbrep.pool import Pool, WorkerError
 from jbrep.rl import Run
 from jbrep.rl.files import read_run
@@ -285,6 +288,22 @@ def test_what_fails_is_closed_kept_and_tried_again(tmp_path):
     told = jbrep(*command[:-1], tmp_path / "f", "--retries", 1)
     assert (told.exit_code, told.stderr.count("retrying")) == (0, 1), told.output
     assert closed(tmp_path)
+
+
+def test_an_episode_that_fails_each_time_ends_it_whatever_the_others_do():
+    task = describe("Sledges/Broken-v0", {"how": "raises", "seed": 12}, 10)
+    lanes = Lanes(task, 3, retries=Retries(1))
+    begun = 0
+
+    def begin():
+        nonlocal begun
+        begun += 1
+        assert begun < 5
+        return lambda observation: np.zeros((3, 3))
+
+    with pytest.warns(Notice, match="retrying"), pytest.raises(EnvironmentFailedError):
+        whole_outcome(lanes, begin, 11)
+    assert begun == 2
 
 
 def test_evaluations_and_training_go_on_after_failures(tmp_path):

@@ -21,7 +21,7 @@ from jbrep.stats.intervals import Bounds, difference_within, mean_within, p_of_d
 from jbrep.stats.nested import components
 from jbrep.stats.power import Arms, obstacle
 from jbrep.stats.rules import Planned, Rules, levels, most_failing
-from jbrep.stats.runs import RunCurve
+from jbrep.stats.runs import RunCurve, with_failure_returns
 from jbrep.stats.spread import Curves, log_spread, ratio_of_spreads, spread_p
 
 RETURNS = Bounds(0, 1000)
@@ -446,6 +446,35 @@ def test_half_of_a_gain_is_counted_on_the_starts_of_the_curve_that_comes_to_it()
     assert group.thresholds["steps_to_50_percent"] == pytest.approx(550, abs=10)
     assert group.labels[0].numbers["gain"].value == pytest.approx(600)
     assert group.labels[0].numbers["final_return_mean"].value == 350
+
+
+def test_where_runs_are_cut_returns_are_held_to_what_those_starts_return():
+    """Their last evaluations, of more starts, are at different steps and can't be compared."""
+    facts = {"reference": 50, "reference_in_training": 250, "final": np.full(20, 350.0)}
+    runs = arm("full", drawn(850, 20, 8, 0), **facts)
+    longer = [
+        replace(
+            run,
+            representation="dae-12",
+            steps=np.append(run.steps, run.steps[-1] + 10_000),
+            returns=np.concatenate((run.returns, run.returns[-1:])),
+            total_steps=run.total_steps + 10_000,
+        )
+        for run in runs
+    ]
+    frame, _ = measure({"full": runs, "dae-12": longer}, range(8))
+    assert (frame.reference, frame.half) == (250, 550)
+    few, many = runs[0].returns.shape[1], len(facts["final"])
+    played = {KEY[0]: {"standing still": [250.0] * few + [0.0] * (many - few)}}
+    (group,) = analyse(runs + longer, references=played).groups
+    assert group.cut
+    assert (group.reference, group.blind.value) == (250, 250)
+
+
+def test_a_failed_run_is_as_bad_as_the_worst_start_of_all():
+    bad, good = arm("full", drawn(-900, 20, 2, 0), return_floor=None)
+    runs = [replace(bad, final=np.full(20, -5000.0)), good]
+    assert {run.failure_return for run in with_failure_returns(runs)} == {-5000}
 
 
 def test_no_step_comes_to_a_share_of_a_gain_that_curves_do_not_show():

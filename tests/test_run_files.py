@@ -346,6 +346,7 @@ def spoilt(header):
         yield {**header, "settings": {**header["settings"], name: 10**30}}
     for value in (-1, 1.5, "x"):
         yield {**header, "step": value}
+        yield {**header, "counters": {**header["counters"], "num_timesteps": value}}
 
 
 def test_a_damaged_checkpoint_is_named(under_way):
@@ -361,6 +362,17 @@ def test_a_damaged_checkpoint_is_named(under_way):
     assert "not finite" in refused(load_run, under_way)
     path.write_bytes(path.read_bytes()[:100])
     assert CHECKPOINT in refused(load_run, under_way)
+
+
+def test_a_checkpoint_that_nothing_can_go_on_from_is_named(under_way):
+    path = under_way / CHECKPOINT
+    tensors, header = container.read(path, "checkpoint", 1 << 30)
+    kind, *others = header["counters"]["numpy"]
+    counters = {**header["counters"], "numpy": [kind, 10**30, *others[1:]]}
+    container.write(path, tensors, {**header, "counters": counters})
+    assert f"{CHECKPOINT} is damaged: delete it to start over" in refused(
+        train, SETTINGS, under_way
+    )
 
 
 def test_a_run_without_a_checkpoint_so_far(under_way):

@@ -535,6 +535,7 @@ def test_three_runs_are_points_and_no_interval_leaves_what_is_possible():
 def test_three_digits_are_shown_without_powers_of_ten():
     assert interval([-826.4, -1194.0, -0.00919], SIGNIFICANT) == "-826 [-1,194, -0.00919]"
     assert interval([99999.9, None, None], SIGNIFICANT) == "100,000"
+    assert interval([999.6, None, None], SIGNIFICANT) == "1,000"
     assert interval([None, None, None], SIGNIFICANT) == "-"
 
 

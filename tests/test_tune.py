@@ -4,7 +4,7 @@ import tomllib
 
 import pytest
 import wandb
-from command import jbrep
+from command import jbrep, mistake
 
 from jbrep.envs import describe
 from jbrep.errors import InputError
@@ -59,6 +59,12 @@ def test_the_command_writes_a_preset_that_rl_takes(tmp_path):
     preset = ("--preset", tmp_path / "it" / BEST)
     told = jbrep("rl", *search, "--evaluation-episodes", 1, *preset, "--out", tmp_path / "run")
     assert told.exit_code == 0, told.output
+
+
+def test_a_folder_with_other_things_is_no_search(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    told = mistake("tune", "--task", "face_direction", "--steps", "1k", "--out", tmp_path)
+    assert "holds other things, such as thesis.txt" in told
 
 
 def test_weights_and_biases_gets_what_tensorboard_gets(tmp_path, monkeypatch):

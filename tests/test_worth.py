@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import time
 from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,9 @@ from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError, Notice
 from jbrep.evaluate.evaluation import Evaluation, Learned, Lost, Score
+from jbrep.play.sources import find_good_policy
 from jbrep.records.document import read_document
+from jbrep.records.lock import exclusive
 from jbrep.report.evaluation import evaluation_text
 from jbrep.report.worth import condition
 from jbrep.rl.trainers import train_jobs
@@ -120,13 +123,28 @@ def test_without_the_environment_returns_are_estimated(data):
     assert 0 <= found.score.value <= data.task.max_episode_steps
 
 
+def test_an_estimated_return_is_that_of_the_policy():
+    held, task = line().held, describe("face_direction").replace(max_episode_steps=100)
+    as_it_is = SimpleNamespace(encode=lambda seen: seen)
+
+    def estimated(unseen, direction):
+        ground = Ground(task, 1, held, unseen, None)
+        choose = lambda codes: direction * np.sign(codes)  # noqa: E731
+        return offline._estimated(as_it_is, ground, choose).value
+
+    assert estimated(
+        Transitions(**{**held._asdict(), "reward": np.ones(len(held))}), 1
+    ) == pytest.approx(100)
+    assert estimated(held, -1) > estimated(held, 1) + 20  # to the middle, and away from it
+
+
 @pytest.fixture(scope="module")
 def told(data, tmp_path_factory):
     """What `jbrep evaluate --worth fitted` prints, and its folder."""
     out = tmp_path_factory.mktemp("told") / "a"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fitted, "_TREES", 4)
-        patch.setattr(fitted, "_BACKUPS", 10)
+        patch.setattr(fitted, "BACKUPS", 10)
         arguments = "--encoder", "pca-8", "--data", data.folder, "--out", out
         return jbrep("evaluate", *arguments, "--worth", "fitted").output, out
 
@@ -180,6 +198,16 @@ def test_what_is_known_stays_and_the_rest_goes_on(data, told, tmp_path, monkeypa
     }
 
 
+def test_nobody_else_writes_while_codes_are_learned(data, told, tmp_path, monkeypatch):
+    arguments = {"pca-8": find("pca-8", data.task)}, data, tmp_path, ["agent"]
+    monkeypatch.setattr(agents, "learned", None)  # would fail
+    with (
+        exclusive(tmp_path / "evaluation.json", beside=True),
+        pytest.raises(InputError, match="is being written by process"),
+    ):
+        work_out(known(told), *arguments)
+
+
 def test_the_time_of_agents_that_were_stopped_counts(data, told, tmp_path, monkeypatch):
     clock, score = iter([0, 5, 10, 14]), Score(1.0, 0.5, 2.0)
     monkeypatch.setattr(time, "process_time", lambda: next(clock))
@@ -202,7 +230,9 @@ def test_the_time_of_agents_that_were_stopped_counts(data, told, tmp_path, monke
 def test_agents_learn_from_codes(data, tmp_path, monkeypatch):
     monkeypatch.setattr(agents, "STEPS", 200)
     monkeypatch.setattr(agents, "RUNS", 1)
-    codes = {label: find(label, data.task) for label in ("full", "pca-8")}
+    codes = {
+        label: find(label.partition(",")[0], data.task) for label in ("full", "pca-8, shipped")
+    }
     returns = agents.learned(codes, data.task, tmp_path)
     assert all(0 <= low < mean < high <= 100 for mean, low, high in returns.values())
 
@@ -331,6 +361,8 @@ def test_own_rewards_are_never_compared_with_those_of_the_environment(data, tmp_
     arguments = "--encoder", "pca-8", "--data", own, "--worth", "agent", "--out", tmp_path / "c"
     assert "gives other rewards" in mistake("evaluate", *arguments)
     assert not (tmp_path / "c").exists()  # nothing takes time before
+    assert find_good_policy(None, data.task, own_rewards=True) is None
+    assert find_good_policy("heuristic", data.task, own_rewards=True).states is None
 
 
 def test_steps_are_held_out_as_from_encoders(data):

@@ -55,7 +55,8 @@ def main() -> None:
         written, still = beside[task][LOOKING], beside[task][STILL]
         if {len(learned), len(written)} != {COUNTED}:
             sys.exit(
-                f"{run} was evaluated in {len(learned)} episodes at last: {COUNTED} are needed"
+                f"{run} has {len(learned)} episodes at last, the hand-written policy "
+                f"{len(written)}: {COUNTED} of each are needed"
             )
         reached, least, most = (float(np.median(each)) for each in (learned, still, written))
         if reached - least < most - reached:

@@ -1,7 +1,6 @@
 """What the commands share: how mistakes are shown, options, numbers as people write them."""
 
 import errno
-import math
 import os
 import signal
 import sys
@@ -9,6 +8,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,17 +42,16 @@ class _Count(click.ParamType[int]):
         text = str(value).replace("_", "").lower()
         factor = {"k": 1_000, "m": 1_000_000}.get(text[-1:], 1)
         digits = text[:-1] if factor > 1 else text
-        if digits.isdecimal():
-            return int(digits) * factor
         try:
-            number = float(digits) * factor
-        except ValueError:
-            number = math.nan
-        if not number.is_integer():
+            number = Decimal(digits) * factor
+        except ArithmeticError:
+            number = Decimal("nan")
+        if not (number.is_finite() and abs(number) < _TOO_LARGE and number == int(number)):
             self.fail(f"{value!r} isn't a whole number: write it as 5000000, 5_000_000, 5e6 or 5M")
         return int(number)
 
 
+_TOO_LARGE = 10**18
 COUNT, POSITIVE = _Count(), _Count(least=1)
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 RESUMES = "the same command resumes it"

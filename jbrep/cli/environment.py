@@ -140,7 +140,7 @@ def parse_arguments(given: tuple[str, ...], option: str = "--env") -> dict[str, 
             )
         try:
             arguments[name] = json.loads(value)
-        except ValueError:
+        except (ValueError, RecursionError):
             arguments[name] = value
     return arguments
 

@@ -38,7 +38,7 @@ _TASK = "face_direction"
 @task_option
 @threads_option
 @retries_option
-@click.option("--algorithm", default="sac", show_default=True, help="Of a zip file.")
+@click.option("--algorithm", help="Of a zip file.  [default: sac]")
 @click.option(
     "--vecnormalize",
     type=PATH,
@@ -74,7 +74,7 @@ def evaluate_policy(
     threads: int | None,
     retries: int,
     trust: bool,
-    algorithm: str,
+    algorithm: str | None,
     vecnormalize: Path | None,
     encoder: str | None,
     perturbations: tuple[str, ...],
@@ -234,7 +234,7 @@ def _title(policy: str, player: "Player") -> str:
 class _Zip(NamedTuple):
     """What is said of a zip file."""
 
-    algorithm: str
+    algorithm: str | None
     trust: bool
     vecnormalize: Path | None
 
@@ -243,7 +243,8 @@ class _Zip(NamedTuple):
         from jbrep.play.sources import as_player
         from jbrep.rl.from_zip import load_zip  # imports torch
 
-        found = load_zip(path, task, self.algorithm, encoder, self.trust, self.vecnormalize)
+        algorithm = self.algorithm or "sac"
+        found = load_zip(path, task, algorithm, encoder, self.trust, self.vecnormalize)
         if found.note:
             say(f"note: {found.note}", err=True)
         return as_player(str(path), found.trained, task)
@@ -261,8 +262,8 @@ def _find(policy: str, task: "Task | None", encoder: str | None, zip_file: _Zip)
         task = task or describe(_TASK)
     is_folder = exists(path) and path.is_dir()
     is_zip = not (sources.is_by_name(policy) or sources.is_trained(policy) or is_folder)
-    if zip_file.vecnormalize and not is_zip:
-        raise InputError("--vecnormalize is for zip files: others have their own statistics")
+    if not is_zip and (unused := [name for name, given in zip_file._asdict().items() if given]):
+        raise InputError(f"--{unused[0]} is for zip files from elsewhere: leave it out")
     if sources.is_trained(policy) or is_folder:
         if encoder and not (folder and encoder == _code_of(folder)):
             raise InputError(
@@ -282,7 +283,7 @@ def _find(policy: str, task: "Task | None", encoder: str | None, zip_file: _Zip)
 
 def _code_of(folder: Path) -> str | None:
     """The code of the encoder that a run was made with, if it is code."""
-    from jbrep.rl.policy import run_settings  # imports torch
+    from jbrep.rl.checkpoint import run_settings  # imports torch
 
     return run_settings(folder).encoder_code
 

@@ -67,6 +67,8 @@ def study(
     from jbrep.records.storage import exists
     from jbrep.records.toml import read_toml
 
+    if dry_run and register:
+        raise InputError("--dry-run and --register exclude each other: choose one")
     if not exists(study):
         raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)

@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -87,7 +88,7 @@ class Separate:
     """
 
     def __init__(self, task: Task, num_lanes: int, retries: Retries):
-        self._task, self._retries = task, retries
+        self._task, self._retries = task, [copy(retries) for _ in range(num_lanes)]
         self.envs: list[Any] = []
         try:
             for _ in range(num_lanes):
@@ -173,7 +174,7 @@ class Separate:
                 truncated[lane] |= self.lost[lane]
                 self._active[lane] = not (terminated[lane] or truncated[lane])
                 if not (self._active[lane] or self.lost[lane]):
-                    self._retries.succeeded()
+                    self._retries[lane].succeeded()
         return self._observation, self._reward, terminated, truncated, self._arrays
 
     def _step(self, lane: int, action: NDArray[np.float32]) -> tuple[bool, bool]:
@@ -259,7 +260,7 @@ class Separate:
                 f"episode with seed {self._episodes[lane].seed}: {reason(error)}",
                 lane,
             )
-        self._retries.failed(error)
+        self._retries[lane].failed(error)
 
     def render(self) -> tuple[Any, ...]:
         """As a vector environment."""

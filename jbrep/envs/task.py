@@ -161,6 +161,12 @@ class View(Record, frozen=True):
             raise InputError("all features are hidden: leave some to see")
 
     @property
+    def suffix(self) -> str:
+        """What the name of the task ends with."""
+        without = f".without-{len(self.hidden)}" if self.hidden else ""
+        return without + (f".history-{self.history}" if self.history > 1 else "")
+
+    @property
     def places(self) -> list[int]:
         """Where the features that are seen stand among all."""
         return [i for i, each in enumerate(self.features) if each.name not in self.hidden]

@@ -34,10 +34,8 @@ def with_view(task: Task, hidden: Iterable[str] = (), history: int = 1) -> Task:
     view = View(features=task.features, hidden=left_out, history=history)
     if not view.hidden and history == 1:
         return task
-    without = f".without-{len(view.hidden)}" if view.hidden else ""
-    past = f".history-{history}" if history > 1 else ""
     seen = view.seen(task.action_low, task.action_high)
-    return task.replace(name=f"{task.name}{without}{past}", features=seen, view=view)
+    return task.replace(name=f"{task.name}{view.suffix}", features=seen, view=view)
 
 
 class Window:

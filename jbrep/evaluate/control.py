@@ -204,10 +204,10 @@ def needs(
     ahead = min(learnt.forward, key=lambda steps: abs(steps - _HORIZON))
     count = max(2, _NUMBERS // held_out.data.task.size)  # rows in which features are shuffled
     steps = held_out.once(following, "test", ahead)
-    seen, told = steps.observation[:count], learnt.forward[ahead]
-    inputs = steps.action[:count]
+    some, told = sample(np.arange(len(steps.rows)), count), learnt.forward[ahead]
+    seen, inputs = steps.observation[some], steps.action[some]
     shares = _shares(
-        lambda seen: told(np.hstack((full.encode(seen), inputs))), seen, steps.wanted[:count]
+        lambda seen: told(np.hstack((full.encode(seen), inputs))), seen, steps.wanted[some]
     )
     moving, reward = shares[:, :-1], shares[:, -1]
     of_policy = _of_policy(full, policy, learnt.of_policy, seen) if policy else []
@@ -232,9 +232,9 @@ def _of_policy(
     asked = [shares("action", seen, policy.act(seen))]
     if states := policy.states:
         count = len(seen) // len(states.folds)
+        drawn = [(name, sample(np.flatnonzero(judged), count)) for name, judged in _named(states)]
         of_folds = [
-            shares(name, states.observation[judged][:count], states.value[judged][:count])
-            for name, judged in _named(states)
+            shares(name, states.observation[some], states.value[some]) for name, some in drawn
         ]
         asked.append(np.mean(of_folds, axis=0))
     return asked

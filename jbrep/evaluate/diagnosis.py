@@ -1,14 +1,13 @@
 """Encoders side by side on the held-out part of a data set."""
 
-import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from joblib import cpu_count
 from msgspec import UNSET, UnsetType
 
 from jbrep.dataset import Dataset, ScaledDataset
@@ -22,7 +21,7 @@ from jbrep.errors import InputError
 from jbrep.evaluate import control, prediction, readout
 from jbrep.evaluate.control import GoodPolicy, Needs, lost, needs
 from jbrep.evaluate.evaluation import EVALUATION, KEPT, Diagnostics, Evaluation, JudgedOn
-from jbrep.evaluate.held_out import HeldOut
+from jbrep.evaluate.held_out import HeldOut, Rows
 from jbrep.evaluate.reconstruction import corruption, reconstruction
 from jbrep.evaluate.regression import Networks, beside, fit
 from jbrep.progress import Progress
@@ -30,7 +29,9 @@ from jbrep.records.document import read_document
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, make_folder
 from jbrep.stats.bootstrap import RESAMPLES
-from jbrep.training.trainer import single_torch_thread
+from jbrep.training.trainer import single_thread
+
+_CHECKED = 100_000  # rows at once
 
 
 def write(
@@ -68,16 +69,15 @@ def _before(
     """The evaluation of the same that a repeated one replaces, if there is one.
 
     Raises:
-        InputError: what is there is something else.
+        InputError: what is there is of something else, or can't be read.
     """
     if not exists(path):
         return None
     on = data.dataset.manifest.fingerprint, _fingerprint(truth)
     wanted = *on, encoders, policy.name if policy else None
-    with suppress(InputError):
-        there = read_document(path, Evaluation)
-        if (there.data.fingerprint, there.data.truth, there.hashes, there.policy) == wanted:
-            return there
+    there = read_document(path, Evaluation)
+    if (there.data.fingerprint, there.data.truth, there.hashes, there.policy) == wanted:
+        return there
     raise InputError(
         f"{path} is not an evaluation of these encoders on this data: choose another --out"
     )
@@ -116,7 +116,11 @@ def diagnose(
     held_out = HeldOut(data, truth)
     judged = {label: find(each, data.task) for label, each in encoders.items()}
     for label, encoder in judged.items():
-        _check(label, encoder, data)
+        if label == FULL:
+            raise InputError(
+                f"the label {FULL} is reserved for the observation itself: choose another"
+            )
+        _check_finite(label, encoder, data, sample(data.test, 1000))
     header = EncoderHeader(kind=FULL, name=FULL, environment=data.task)
     full = Encoder(header, data.scaler, (), ())
     results, needed = _side_by_side({FULL: full, **judged}, held_out, policy)
@@ -133,7 +137,7 @@ def diagnose(
 
 def hashes(encoders: Mapping[str, BaseEncoder]) -> dict[str, str]:
     """SHA-256 of encoders by label; of a module, that of the file that a run keeps of it."""
-    with single_torch_thread():
+    with single_thread():
         return {label: as_file(encoder).fingerprint for label, encoder in encoders.items()}
 
 
@@ -150,7 +154,7 @@ def _side_by_side(
         learnt = networks(full, held_out, policy)
         return learnt, needs(full, held_out, policy, learnt)
 
-    with single_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+    with single_thread(), ThreadPoolExecutor(cpu_count()) as pool:
         begun = pool.submit(begin)
         total = len(encoders) * len(_DIAGNOSTICS)
         with Progress(total=total, unit="diagnostic") as progress:
@@ -172,7 +176,16 @@ def _side_by_side(
                     **known,
                 )
 
-            futures = {label: pool.submit(judge, label) for label in reversed([*encoders])}
+            def judge_or_blame(label: str) -> Diagnostics:
+                try:
+                    return judge(label)
+                except (ValueError, np.linalg.LinAlgError):
+                    data = held_out.data
+                    for rows in (data.train, data.test):
+                        _check_finite(label, encoders[label], data, rows)
+                    raise
+
+            futures = {label: pool.submit(judge_or_blame, label) for label in reversed([*encoders])}
             try:
                 results = {label: futures[label].result() for label in encoders}
                 return results, begun.result()[1].controller
@@ -232,15 +245,13 @@ def networks(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None 
     return Networks(forward, next(fitted), dict(zip(of_policy, fitted, strict=True)))
 
 
-def _check(label: str, encoder: BaseEncoder, data: ScaledDataset) -> None:
-    if label == FULL:
-        raise InputError(f"the label {FULL} is reserved for the observation itself: choose another")
-    rows = data.dataset["observation"][sample(data.test, 1000)]
-    with np.errstate(over="ignore", invalid="ignore"):
-        latent = encoder.encode(rows)
-        back = encoder.decode(latent) if encoder.can_decode else latent
-    if not np.isfinite(back).all():
-        raise InputError(f"{label} gives numbers that are not finite: train it again")
+def _check_finite(label: str, encoder: BaseEncoder, data: ScaledDataset, rows: Rows) -> None:
+    for some in np.array_split(rows, -(-len(rows) // _CHECKED)):
+        with np.errstate(over="ignore", invalid="ignore"):
+            latent = encoder.encode(data.dataset["observation"][some])
+            back = encoder.decode(latent) if encoder.can_decode else latent
+        if not np.isfinite(back).all():
+            raise InputError(f"{label} gives numbers that are not finite: train it again")
 
 
 def seen(encoder: BaseEncoder, data: ScaledDataset) -> Literal["no test row", "none", "maybe"]:

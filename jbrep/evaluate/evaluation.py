@@ -227,8 +227,12 @@ class Evaluation(Document, frozen=True, kw_only=True):
     def text(self) -> str:
         """As JSON, with numbers of six digits and each list of numbers on one line."""
         text = json.dumps(sealed(_rounded(self.as_json())), indent=self.indent)
-        one_line = re.compile(r"\[[-+.,\deEnul\s]*\]")
-        return one_line.sub(lambda match: " ".join(match[0].split()), text) + "\n"
+        parts = re.compile(r'"(?:[^"\\]|\\.)*"|\[[-+.,\deEnul\s]*\]')  # text stays as it is
+
+        def on_one_line(part: re.Match[str]) -> str:
+            return part[0] if part[0].startswith('"') else " ".join(part[0].split())
+
+        return parts.sub(on_one_line, text) + "\n"
 
 
 def _rounded(value: Any) -> Any:

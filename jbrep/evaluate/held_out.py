@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from itertools import pairwise
+from threading import Lock
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -54,12 +55,14 @@ class HeldOut:
         self.numbers = np.unique(self._episode(data.test))
         self.num_groups = min(len(self.numbers), MAX_GROUPS)
         self._found: dict[tuple[Any, ...], Any] = {}
+        self._lock = Lock()
 
     def once(self, compute: Callable[..., _T], *given: Any) -> _T:
         """What a function makes of this and of what else is given, computed for the first only."""
-        if (compute, *given) not in self._found:
-            self._found[compute, *given] = compute(self, *given)
-        found: _T = self._found[compute, *given]
+        with self._lock:
+            if (compute, *given) not in self._found:
+                self._found[compute, *given] = compute(self, *given)
+            found: _T = self._found[compute, *given]
         return found
 
     def __len__(self) -> int:

@@ -24,6 +24,7 @@ from jbrep.inspection.robot import Robot
 from jbrep.inspection.signals import MOST_LINES, times_at
 from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.rollout import Rollout
+from jbrep.text import number
 
 FAN = "world/fan"
 SERIES = "forecast"
@@ -83,7 +84,7 @@ class Fan(NamedTuple):
             "|---" * len(self.steps) + "|",
         ]
         for name, scores in zip(self.shown, self.explained.T, strict=False):
-            cells = " | ".join("-" if np.isnan(score) else f"{score:.2f}" for score in scores)
+            cells = " | ".join(map(_score, scores))
             lines.append(f"| {_words(name)} | {cells} |")
         return "\n".join(lines)
 
@@ -120,7 +121,8 @@ def make_fan(rollout: Rollout, encoder: BaseEncoder, examples: Examples) -> Fan 
 def send_fan(recording: Recording, rollout: Rollout, fan: Fan, robot: Robot | None) -> None:
     """Send series of the state's first columns and, of the Jitterbug, lines and headings."""
     _send_series(recording, rollout, fan)
-    if robot and jitterbug_task(rollout.task):
+    named = {*_POSITION, *_HEADING} <= {*fan.names}  # features may have been renamed
+    if robot and named and jitterbug_task(rollout.task):
         times = times_at(rollout.task, fan.starts)
         for name, states in {**fan.lines, TRUTH: fan.truth}.items():
             _send_lines(recording, times, fan, name, states, robot.size)
@@ -131,10 +133,14 @@ def fan_pages(task: Task, fan: Fan) -> list[rrb.Grid]:
     middle = len(fan.steps) // 2
     scores = fan.explained[middle - 1]
     titles = {
-        f"{_words(name)}: R² {score:.2f} over {fan.steps[middle]} steps": [f"{_path(name)}/**"]
+        f"{_words(name)}: R² {_score(score)} over {fan.steps[middle]} steps": [f"{_path(name)}/**"]
         for name, score in zip(fan.shown, scores, strict=False)
     }
     return series_pages("forecasts", task, titles)
+
+
+def _score(value: float) -> str:
+    return number(None if np.isnan(value) else value, ".2f")
 
 
 def _words(name: str) -> str:

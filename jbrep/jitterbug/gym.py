@@ -125,6 +125,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
                 f"{', '.join(modes)}; human needs a display"
             )
         self._simulation = Simulation(self.task, 1, 1, body, materials)
+        choose(camera, {self.model.camera(i).name: i for i in range(self.model.ncam)}, "camera")
         self.observation_space = self._view.space
         self.action_space = _ACTIONS
         self.render_mode = render_mode

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from threadpoolctl import threadpool_limits
 from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.coordinates import OBSERVATION
@@ -34,7 +33,7 @@ from jbrep.training.trainer import (
     Trainer,
     default_batch_size,
     get_device,
-    single_torch_thread,
+    single_thread,
 )
 from jbrep.training.windows import Windows, count_windows, watched_windows
 
@@ -132,7 +131,7 @@ class Fitter:
         Raises:
             InputError: as `plan`, or the files can't be written.
         """
-        with single_torch_thread(), threadpool_limits(1, "blas"):  # more change the last bits
+        with single_thread():
             plan = self.plan(kind, name=name, **settings)
             is_new = not plan.is_complete() and self._make_once(plan)
         return Fitted(load(plan.path), plan.path, is_new, self._data)

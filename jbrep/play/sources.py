@@ -165,18 +165,21 @@ def _needed(task: Task | None, policy: str) -> Task:
     return task
 
 
-def find_good_policy(source: str | None, task: Task) -> "GoodPolicy | None":
+def find_good_policy(
+    source: str | None, task: Task, own_rewards: bool = False
+) -> "GoodPolicy | None":
     """A policy with the episodes that it plays: the first of those that runs are evaluated on.
 
     Args:
         source: as `find_player` takes it; None for the hand-written policy, if the task has one.
         task: to act in.
+        own_rewards: whether rewards are others than the environment gives: nothing is played then.
 
     Raises:
         InputError: as `find_player`, or the policy doesn't act on what it observes.
     """
     if source is None:
-        if jitterbug_task(task) is None:
+        if own_rewards or jitterbug_task(task) is None:
             return None
         source = _HEURISTIC
     known = POLICIES.get(source.partition(":")[0])
@@ -191,7 +194,7 @@ def find_good_policy(source: str | None, task: Task) -> "GoodPolicy | None":
     def act(observation: NDArray[Any]) -> NDArray[Any]:
         return player.begin(task, range(len(observation)))(observation)
 
-    played = player.play(range(_GOOD_EPISODES))
+    played = [] if own_rewards else player.play(range(_GOOD_EPISODES))
     episodes = [PlayedEpisode(each.observation, each.reward, each.terminated) for each in played]
     return GoodPolicy(source, act, episodes)
 

@@ -24,7 +24,7 @@ from jbrep.text import SIGNIFICANT, Table, number, slug
 _FEW = 6  # representations that are named
 RUNNING = "running mean and variance"  # of what agents see, where they normalise it
 _NOT_SHOWN = ("task", "representation", "encoder", "encoder_code")  # among the settings
-_OPTIONS = ("task", "algorithm", "preset", *TrainingSettings.__struct_fields__)  # of jbrep rl
+_OPTIONS = ("algorithm", "preset", *TrainingSettings.__struct_fields__)  # of jbrep rl
 
 
 def outline(tables: Tables) -> str:
@@ -210,6 +210,8 @@ def setting_table(tables: Tables) -> Table:
             for name, values in tables.record.draws_of(settings["learner"]).items()
         }
         own = {name: value for name, value in settings["overrides"].items() if name not in drawn}
+        domain = str(shared.settings.environment.domain or "") or None
+        settings["environment"]["domain"] = domain  # what it draws is called as settings are
         flat = dict(_flat({**settings, "overrides": own})) | drawn
         columns.setdefault(f"{settings['task']}/{settings['learner']}", flat)
     names = dict.fromkeys(name for settings in columns.values() for name in settings)
@@ -273,17 +275,26 @@ def _imports(record: RunsRecord, study: Study) -> str:
 
 def _command(shared: Label, folder: str) -> str:
     """The command that trains one run of a label."""
-    settings = shared.settings
-    parts = ["jbrep", "rl"]
+    settings, task = shared.settings, shared.settings.environment
+    view = task.view
+    parts = ["jbrep", "rl", "--task", task.name.removesuffix(view.suffix) if view else task.name]
     for name in _OPTIONS:
         parts += [f"--{name.replace('_', '-')}", str(getattr(settings, name))]
+    for name in view.hidden if view else ():
+        parts += ["--hide", name]
+    if view and view.history > 1:
+        parts += ["--history", str(view.history)]
+    if task.missing:
+        parts += ["--missing", task.missing]
+    for name in modules_of(task):
+        parts += ["--import", name]
     for name, value in settings.overrides.items():
         parts += ["--set", f"{name}={json.dumps(value)}"]
-    for name, value in settings.environment.arguments.items():
+    for name, value in task.arguments.items():
         parts += ["--env", f"{name}={json.dumps(value)}"]
-    for each in str(settings.environment.domain or "").split(","):
+    for each in str(task.domain or "").split(","):
         parts += ["--domain", each] if each else []
-    parts += ["--episode-steps", str(settings.environment.max_episode_steps)]
+    parts += ["--episode-steps", str(task.max_episode_steps)]
     label = settings.task, settings.learner, settings.representation
     out = "/".join((folder, *map(slug, label), "seed-0"))  # a task's id may contain a slash
     encoder = settings.encoder_code or shared.encoder.name

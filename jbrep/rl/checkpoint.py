@@ -19,19 +19,19 @@ from jbrep.errors import DamageError, InputError, differences
 from jbrep.records import container
 from jbrep.records.container import Tensors
 from jbrep.records.document import Document, document_from
-from jbrep.records.record import Version
+from jbrep.records.record import Version, shown
 from jbrep.records.storage import exists
 from jbrep.rl.agent import parameters, restore_statistics, statistics_of
-from jbrep.rl.files import Episode, Evaluation, Info
+from jbrep.rl.files import CHECKPOINT, RUN, Episode, Evaluation, Info, read_run
 from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_STEPS
 
-MAX_BYTES = 1 << 34
+MAX_BYTES = 1 << 40
 PARAMETERS = "parameters."  # begins the names of what gradient steps change
 LANES = "lanes."  # likewise, of what decides how the lanes continue
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")  # of an agent
 _QUICK = 2.0  # seconds of writing that don't matter
-_MALFORMED = (KeyError, TypeError, ValueError, RuntimeError, IndexError, AttributeError)
+_MALFORMED = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 WEIGHTS_NOT_FINITE = "the policy's weights are not finite"  # reasons for a run to fail
 ACTIONS_NOT_FINITE = "the policy's actions are not finite"
 
@@ -136,7 +136,9 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
     for name in _COUNTERS:
         setattr(agent, name, counters[name])
     agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
+    agent.start_time = time.time_ns()
     assert agent.ep_info_buffer is not None
+    agent.ep_info_buffer.clear()  # it may go on from a checkpoint of its own
     agent.ep_info_buffer.extend(counters["episodes"])
 
 
@@ -163,6 +165,14 @@ class CheckpointHeader(Document, frozen=True, kw_only=True):
     seconds: float
     counters: Mapping[str, Any]
 
+    def check(self) -> None:
+        """As for `Record`."""
+        super().check()
+        for name in _COUNTERS:
+            count = self.counters.get(name)
+            if type(count) is not int or count < 0:
+                raise InputError(f"{name} is {shown(count)}: it must be a whole number from 0")
+
 
 def read_checkpoint(path: Path) -> tuple[Tensors, CheckpointHeader]:
     """A run's checkpoint.
@@ -175,13 +185,18 @@ def read_checkpoint(path: Path) -> tuple[Tensors, CheckpointHeader]:
     return tensors, document_from(header, path, CheckpointHeader)
 
 
-def begun_settings(path: Path) -> RunSettings:
-    """The settings of a run by its checkpoint's header alone, as the file can be large.
+def run_settings(folder: Path) -> RunSettings:
+    """The settings of a run that has ended or is under way.
+
+    Of a checkpoint the header alone is read, as the file can be large.
 
     Raises:
-        InputError: it has another version of the format.
-        DamageError: the header isn't what was written.
+        InputError: there is no run, or a file has another version of its format.
+        DamageError: a file isn't what was written.
     """
+    if exists(folder / RUN):
+        return read_run(folder).settings
+    path = folder / CHECKPOINT
     return document_from(container.peek(path), path, CheckpointHeader).settings
 
 

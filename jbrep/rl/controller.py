@@ -182,7 +182,7 @@ def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[La
     shape = settings.hyperparameters
     if shape.algorithm_kwargs.get("use_sde") or shape.policy_kwargs.get("use_sde"):
         raise InputError("a policy with use_sde isn't a chain of layers: it can't be taken out")
-    activation = str(shape.policy_kwargs["activation_fn"]).replace("_", "-")
+    activation = str(shape.policy_kwargs.get("activation_fn")).replace("_", "-")
     chain = Chain(inputs)
     for prefix in _HIDDEN:
         parts = _numbered(prefix, weights)
@@ -262,4 +262,7 @@ def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
     normalized = settings.hyperparameters.normalize
     size = encoder.latent_size
     statistics = Statistics.read(file.tensors, size, file.path) if normalized else None
-    return Controller(settings, encoder, weights, statistics)
+    try:
+        return Controller(settings, encoder, weights, statistics)
+    except KeyError as error:
+        raise InputError(f"{file.path} doesn't fit the run's settings: it has no {error}") from None

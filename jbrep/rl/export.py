@@ -8,7 +8,7 @@ from typing import Any
 from jbrep.encoders.encoder import Encoder
 from jbrep.errors import InputError, choose
 from jbrep.records.record import to_plain
-from jbrep.records.storage import exists, taken, write_whole
+from jbrep.records.storage import exists, taken, write_new
 from jbrep.rl.controller import Controller
 
 
@@ -34,9 +34,9 @@ def export(controller: Controller, path: Path, form: str = "onnx") -> None:
             f"the encoder {controller.encoder.name} is code, which a model can't hold: give the "
             "run an encoder's file, as Encoder.from_torch makes it"
         )
-    if exists(path):
+    if exists(path):  # known before the work
         raise taken(path)
-    write_whole(path, write(controller))
+    write_new(path, write(controller))
 
 
 def described(controller: Controller) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from jbrep.records.commit import commits
 from jbrep.records.storage import exists, inside, read_file, write_whole
 from jbrep.records.tables import write_rows
 from jbrep.rl.agent import Evaluator, action_repeat, restore_statistics, statistics_of
-from jbrep.rl.checkpoint import CheckpointFile, History, begun_settings
+from jbrep.rl.checkpoint import CheckpointFile, History, run_settings
 from jbrep.rl.files import (
     BEGINNING,
     CHECKPOINT,
@@ -108,7 +108,7 @@ class Job:
         self.run, self.folder, self.threads = run, folder, threads
         self.retries, self.is_one_robot = retries, is_one_robot
         self.encoder = run.find_encoder()
-        self.settings = self._as_begun(self._going_on(run.settings(self.encoder)))
+        self.settings = self._going_on(self._as_begun(run.settings(self.encoder)))
         self.history = History()
 
     def anew(self) -> "Job":
@@ -138,15 +138,13 @@ class Job:
         return result
 
     def _going_on(self, settings: RunSettings) -> RunSettings:
-        """Settings with evaluations as far apart as before, where a shorter run goes on."""
+        """Settings with evaluations as far apart as before, where a run goes on or has gone on."""
         if self.run.evaluate_every or not is_run(self.folder):
             return settings
-        if exists(self.folder / RUN):
-            before = read_run(self.folder).settings
-        else:
-            before = begun_settings(self.folder / CHECKPOINT)
+        before = run_settings(self.folder)
         same = settings.replace(evaluate_every=before.evaluate_every)
-        return same if before.is_extended_by(same) else settings
+        goes_on = before.is_extended_by(same) or not before.differing(same)
+        return same if goes_on else settings
 
     def _as_begun(self, settings: RunSettings) -> RunSettings:
         """Settings with the policy that a run began with, where its source has gone on since."""

@@ -11,7 +11,7 @@ from jbrep.errors import InputError, differences
 from jbrep.records.container import without
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
-from jbrep.rl.checkpoint import PARAMETERS, read_checkpoint
+from jbrep.rl.checkpoint import PARAMETERS, read_checkpoint, run_settings
 from jbrep.rl.files import (
     BEGINNING,
     CHECKPOINT,
@@ -21,7 +21,6 @@ from jbrep.rl.files import (
     SOON,
     is_run,
     read_finished,
-    read_run,
 )
 from jbrep.rl.overrides import check_shape
 from jbrep.rl.policy_file import read
@@ -80,18 +79,6 @@ def load_untrained(folder: Path) -> Trained:
         return built
     policy = read(folder / BEGINNING, settings.begin_from)
     return built.with_weights(policy.weights, policy.tensors, policy.path)
-
-
-def run_settings(folder: Path) -> RunSettings:
-    """The settings of a run that has ended or is under way.
-
-    Raises:
-        InputError: as `load_run`.
-        DamageError: a file isn't what was written.
-    """
-    if exists(folder / RUN):
-        return read_run(folder).settings
-    return read_checkpoint(folder / CHECKPOINT)[1].settings
 
 
 def _untrained(folder: Path, settings: RunSettings, given: Any) -> Trained:

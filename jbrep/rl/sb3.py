@@ -167,7 +167,8 @@ class _Follower(BaseCallback):
         check_finite(self.model)
         self._tell()  # the last evaluation can take minutes
         if self._session.keep_checkpoint:
-            _draw_noise(self.model)
+            if not self._draws:  # else nothing was trained since, and it is drawn
+                _draw_noise(self.model)
             self._job.checkpoint.write(take(self.model))
         self._job.final_evaluation(self.model)
         self._tell()

@@ -73,7 +73,10 @@ def _alone(jobs: Sequence[Job], opened: ExitStack) -> tuple[float, BaseAlgorithm
 
 def _together(jobs: Sequence[Job], opened: ExitStack) -> tuple[float, BaseAlgorithm]:
     """The same of a cohort: a step of each run."""
-    cohort = opened.enter_context(closing(Cohort([Member(job, []) for job in jobs])))
+    members = [Member(job, []) for job in jobs]
+    for member in members:
+        opened.callback(member.agent.logger.close)
+    cohort = opened.enter_context(closing(Cohort(members)))
     cohort.begin()
 
     def learn() -> None:

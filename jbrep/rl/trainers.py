@@ -61,6 +61,6 @@ def train_jobs(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
             own = [job for job in jobs if job.settings.trainer == trainer and not results[job]]
             for job, record in train_own(own, session):
                 keeps = session.keep_checkpoint and record.status != FAILED
-                if not keeps and read_run(job.folder).settings == record.settings:
+                if not keeps and not read_run(job.folder).settings.differing(record.settings):
                     (job.folder / CHECKPOINT).unlink(missing_ok=True)
                 yield job, record

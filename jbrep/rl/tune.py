@@ -95,7 +95,7 @@ def tune(
     search = Search(
         settings=run.settings(run.find_encoder()), seeds=seeds, optuna=optuna.__version__
     )
-    make_folder(folder)
+    make_folder(folder, (SEARCH, BEST, "trial-*"))
     with exclusive(folder):
         _claim(folder / SEARCH, search)
         if (begun := len([*folder.glob("trial-*")])) > trials:
@@ -106,12 +106,12 @@ def tune(
         for number in range(trials):
             ended.append(_trial(study, number, run, seeds, folder, stop))
             watch(ended[number])
-    sound = [trial for trial in ended if trial.value is not None]
-    if not sound:
-        raise InputError("every trial failed: see the run.json files below the folder")
-    best = max(sound, key=lambda trial: trial.value or 0.0)
-    write_whole(folder / BEST, preset_text(run.learner.overridden(best.overrides)).encode())
-    return best
+        sound = [trial for trial in ended if trial.value is not None]
+        if not sound:
+            raise InputError("every trial failed: see the run.json files below the folder")
+        best = max(sound, key=lambda trial: trial.value or 0.0)
+        write_whole(folder / BEST, preset_text(run.learner.overridden(best.overrides)).encode())
+        return best
 
 
 def _claim(path: Path, search: Search) -> None:

@@ -140,21 +140,22 @@ def _analyse_group(
     planned: Planned,
     seed: int,
 ) -> GroupAnalysis:
-    first = next(iter(group.values()))[0]
+    first, known = next(iter(group.values()))[0], compared(group)
+    starts = None if known.on_all_starts else first.returns.shape[1]
     played = {
-        policy: mean_within(np.array(returns), first.bounds, LEVEL)
+        policy: mean_within(np.array(returns[:starts]), first.bounds, LEVEL)
         for policy, returns in references.items()
     }
     means = {policy: float(each.value) for policy, each in played.items()}
-    grid, cut, curves, finals = compared(group)
-    scale = scale_of(list(finals.values()), next(iter(curves.values())), grid, first, played)
+    scale = scale_of(known, first, played)
     baseline, *others = (
-        describe(runs, curves[name], finals[name], scale, seed) for name, runs in group.items()
+        describe(runs, known.curves[name], known.finals[name], scale, seed)
+        for name, runs in group.items()
     )
     return GroupAnalysis(
         task=first.task,
         algorithm=first.algorithm,
-        cut=cut,
+        cut=known.cut,
         return_floor=_or_nan(first.return_floor),
         return_ceiling=_or_nan(first.return_ceiling),
         failure_return=_or_nan(first.failure_return),

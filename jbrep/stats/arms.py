@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.stats.bootstrap import Array
-from jbrep.stats.curves import compared, final_return, steps_to
+from jbrep.stats.curves import Compared, compared, final_return, steps_to
 from jbrep.stats.intervals import Bounds, surely_above
 from jbrep.stats.runs import Group, RunCurve, with_failure_returns
 from jbrep.stats.scale import reference_in_training, reference_of
@@ -71,10 +71,10 @@ def measure(group: Group, seeds: Collection[int]) -> tuple[Frame, dict[str, Arm]
     counted = with_failure_returns([r for r in chain(*group.values()) if r.seed in seeds])
     of_each = {name: [r for r in counted if r.representation == name] for name in group}
     there = {name: runs for name, runs in of_each.items() if runs}
-    grid, _, curves, finals = compared(there)
-    frame = _frame(there, finals, next(iter(curves.values())), grid)
+    known = compared(there)
+    frame = _frame(there, known)
     return frame, {
-        name: _arm(runs, _own_encoders(group[name]), finals[name], curves[name], grid, frame)
+        name: _arm(runs, _own_encoders(group[name]), name, known, frame)
         for name, runs in there.items()
     }
 
@@ -84,12 +84,11 @@ def learns(arm: Arm, frame: Frame) -> bool:
     return surely_above(arm.final, frame.reference, frame.bounds)
 
 
-def _frame(
-    group: Mapping[str, list[RunCurve]], finals: Mapping[str, Array], curves: Array, grid: Array
-) -> Frame:
+def _frame(group: Mapping[str, list[RunCurve]], known: Compared) -> Frame:
     (first, *_), *_ = group.values()
-    of_baseline = next(iter(finals.values()))
-    reference, over = reference_of(first, curves), reference_in_training(first, curves)
+    grid, curves, finals = known.grid, known.of_baseline, known.finals
+    of_baseline, over = next(iter(finals.values())), reference_in_training(first, curves)
+    reference = reference_of(first, curves) if known.on_all_starts else over
     gain = max(float(of_baseline.mean()) - reference, 0.0)
     gain_in_training = max(float(final_return(curves, grid).mean()) - over, 0.0)
     widths = np.diff(grid)
@@ -106,9 +105,8 @@ def _frame(
     )
 
 
-def _arm(
-    runs: list[RunCurve], by_encoder: bool, final: Array, curves: Array, grid: Array, frame: Frame
-) -> Arm:
+def _arm(runs: list[RunCurve], by_encoder: bool, name: str, known: Compared, frame: Frame) -> Arm:
+    grid, curves, final = known.grid, known.curves[name], known.finals[name]
     units = of_encoders(runs) if by_encoder else [[number] for number in range(len(runs))]
     time = np.minimum(steps_to(curves, grid, frame.half_in_training) - grid[0], frame.steps)
     return Arm(

@@ -103,17 +103,21 @@ def final_return(curves: Array, grid: Array) -> Array:
     return curves[:, grid >= end - _LAST * (end - start)].mean(axis=1)
 
 
+def end_on_all_starts(group: Mapping[str, Sequence[RunCurve]], grid: Array) -> bool:
+    """Whether all runs that didn't fail end with an evaluation of more episodes there."""
+    whole = [run for runs in group.values() for run in runs if run.failed_at is None]
+    return bool(whole) and all(r.final is not None and r.steps[-1] <= grid[-1] for r in whole)
+
+
 def final_returns(
     group: Mapping[str, Sequence[RunCurve]], curves: Mapping[str, Array], grid: Array
 ) -> dict[str, Array]:
     """The final return of each run of each representation, (runs,) each, from curves (runs, g).
 
-    Where all that didn't fail end with an evaluation of more episodes, at the end of the grid, it
-    is their mean; else that of the evaluations in the last tenth of the grid. A run that failed
-    ends with its failure_return.
+    It is the mean of the last evaluation if all `end_on_all_starts`, else that of the evaluations
+    in the last tenth of the grid. A run that failed ends with its failure_return.
     """
-    whole = [run for runs in group.values() for run in runs if run.failed_at is None]
-    if not whole or any(run.final is None or run.steps[-1] > grid[-1] for run in whole):
+    if not end_on_all_starts(group, grid):
         return {name: final_return(each, grid) for name, each in curves.items()}
     finals = {}
     for name, runs in group.items():
@@ -135,6 +139,12 @@ class Compared(NamedTuple):
     # of each representation's runs on the grid, (runs, g), the baseline first
     curves: dict[str, Array]
     finals: dict[str, Array]  # the final return of each of these runs, (runs,)
+    on_all_starts: bool  # whether that is of the starts of the last evaluation, not of the curves'
+
+    @property
+    def of_baseline(self) -> Array:
+        """The curves of the baseline, (runs, g)."""
+        return next(iter(self.curves.values()))
 
 
 def compared(group: Group) -> Compared:
@@ -145,7 +155,8 @@ def compared(group: Group) -> Compared:
     """
     grid, cut = common_grid(group)
     curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in group.items()}
-    return Compared(grid, cut, curves, final_returns(group, curves, grid))
+    on_all_starts = end_on_all_starts(group, grid)
+    return Compared(grid, cut, curves, final_returns(group, curves, grid), on_all_starts)
 
 
 def mean_return(curves: Array, grid: Array) -> Array:

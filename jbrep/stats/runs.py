@@ -186,7 +186,8 @@ def with_failure_returns(runs: Sequence[RunCurve]) -> list[RunCurve]:
     """
     worst: dict[Key, float] = {}
     for run in runs:
-        seen = run.returns.min(initial=np.inf) if run.return_floor is None else run.return_floor
+        every = run.returns if run.final is None else np.append(run.returns, run.final)
+        seen = every.min(initial=np.inf) if run.return_floor is None else run.return_floor
         key = run.task, run.algorithm
         worst[key] = min(worst.get(key, np.inf), float(seen))
     known = {key: value for key, value in worst.items() if np.isfinite(value)}

@@ -1,13 +1,13 @@
 """What all representations of a task and algorithm are measured by."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.curves import final_return
+from jbrep.stats.curves import Compared, final_return
 from jbrep.stats.intervals import UNDEFINED, surely_above
 from jbrep.stats.runs import RunCurve
 
@@ -40,7 +40,7 @@ def best_blind(returns: Mapping[str, float]) -> str | None:
 
 
 def reference_of(run: RunCurve, curves: Array) -> float:
-    """The return that gains are counted over.
+    """The return that gains are counted over, on all starts of the last evaluation.
 
     That is the run's own reference where it is known, else the least possible return of the task,
     else the mean return at the first step of the baseline's curves on the grid, (runs, g), that is,
@@ -59,24 +59,18 @@ def reference_in_training(run: RunCurve, curves: Array) -> float:
     return reference_of(run, curves) if known is None else known
 
 
-def scale_of(
-    finals: Sequence[Array],
-    curves: Array,
-    grid: Array,
-    run: RunCurve,
-    policies: Mapping[str, Interval],
-) -> Scale:
+def scale_of(compared: Compared, run: RunCurve, policies: Mapping[str, Interval]) -> Scale:
     """The scale of a group of runs.
 
     Args:
-        finals: final returns of each representation's runs, (runs,) each, the baseline first.
-        curves: of the baseline's runs on the grid (g,), (runs, g).
-        grid: training steps.
+        compared: the runs.
         run: any of the group.
-        policies: mean returns of policies that don't learn, with their intervals.
+        policies: mean returns of policies that don't learn, with their intervals, on the starts of
+            the final returns.
     """
-    reference, solved = reference_of(run, curves), run.solved
-    over = reference_in_training(run, curves)
+    grid, curves, finals = compared.grid, compared.of_baseline, [*compared.finals.values()]
+    over, solved = reference_in_training(run, curves), run.solved
+    reference = reference_of(run, curves) if compared.on_all_starts else over
     best = best_blind({name: float(each.value) for name, each in policies.items()})
     gained = surely_above(finals[0], reference, run.bounds)
     gain = float(np.median(final_return(curves, grid))) - over

@@ -16,6 +16,7 @@ from jbrep.errors import InputError
 from jbrep.progress import Progress
 from jbrep.rl import Run
 from jbrep.rl.cohort.replay import memory_of
+from jbrep.rl.overrides import is_off_policy
 from jbrep.rl.run import trainer_of
 from jbrep.rl.settings import COHORT, CPU, CUDA
 from jbrep.rl.speed import estimate
@@ -67,7 +68,12 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
     widest = _WIDEST[plan.device]
     limits = (_most(plan, group[0], size, workers) for (_, _, size), group in groups.items())
     most = min(limits, default=width or widest)
-    if most < 1 < workers:
+    of_alone = [
+        _most(plan, cell, _observed(plan, cell), workers)
+        for cell in {cell.kind: cell for (cell,) in alone}.values()
+        if is_off_policy(cell.learner.algorithm)
+    ]
+    if min(most, *of_alone) < 1 < workers:
         raise InputError(
             f"this machine's memory doesn't hold an agent for each of {workers} workers: give "
             "fewer --workers"

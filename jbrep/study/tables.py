@@ -229,7 +229,7 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
         for file in files:
             known = evaluated(file) | known
     if exists(path):
-        known = _there_too(path, record.tables.get(DIAGNOSTICS, ""), used, known) | known
+        known = _there_too(path, record.tables.get(DIAGNOSTICS), used, known) | known
     rows = [row._replace(values=known[_key(row)]) for row in used if _key(row) in known]
     tables = {**record.tables, DIAGNOSTICS: write_diagnostics(path, rows)}
     if tables != record.tables:
@@ -238,9 +238,15 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
 
 
 def _there_too(
-    path: Path, sha256: str, used: Iterable[Diagnosed], known: Mapping[_Key, Values]
+    path: Path, sha256: str | None, used: Iterable[Diagnosed], known: Mapping[_Key, Values]
 ) -> dict[_Key, Values]:
     """What the table says already; one that is another isn't needed where all is known.
+
+    Args:
+        path: of the table.
+        sha256: of it; None if that isn't known, as where runs.json is written anew.
+        used: encoders.
+        known: of them already.
 
     Raises:
         DamageError: the table is another, and some of the encoders are known from it alone.

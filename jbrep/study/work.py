@@ -66,9 +66,11 @@ def work(
     except Exception as error:
         if len(assigned) == 1:
             return [_crashed(assigned[0], error)]
-        alone = [work([each], stop, modules) for each in assigned]  # to see whose error it is
-        return None if None in alone else [outcome for each in alone for outcome in each or ()]
-    return [_ended(each, results[each.folder]) for each in assigned]
+    else:
+        return [_ended(each, results[each.folder]) for each in assigned]
+    # Now that the error, which held all that they had learned with, is gone: whose was it?
+    alone = [work([each], stop, modules) for each in assigned]
+    return None if None in alone else [outcome for each in alone for outcome in each or ()]
 
 
 def _ended(assigned: Assigned, result: RunRecord) -> Outcome:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
@@ -205,3 +206,10 @@ def single_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+@contextmanager
+def single_thread() -> Iterator[None]:
+    """Limit torch and what NumPy and SciPy compute with to one thread, for the same reasons."""
+    with single_torch_thread(), threadpool_limits(1, "blas"):
+        yield

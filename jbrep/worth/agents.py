@@ -17,6 +17,7 @@ from jbrep.rl.job import Job, Session
 from jbrep.rl.run import Run
 from jbrep.rl.trainers import train_jobs
 from jbrep.stats.intervals import LEVEL, mean_within
+from jbrep.text import slug
 from jbrep.worth.offline import EPISODES, bounds_of
 
 _ALGORITHM = "sac"
@@ -43,13 +44,13 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
                 task,
                 _ALGORITHM,
                 encoder=encoder,
-                representation=label,
+                representation=slug(label)[-100:],
                 seed=seed,
                 steps=STEPS,
                 evaluate_every=STEPS,
                 final_episodes=EPISODES,
             ),
-            folder / label / f"seed-{seed}",
+            folder / slug(label)[-100:] / f"seed-{seed}",
             cpu_count(),
         )
         for label, encoder in encoders.items()

@@ -22,7 +22,8 @@ Codes = NDArray[np.float32]  # (n, l)
 Actions = NDArray[np.float32]  # (n, k), in [-1, 1]
 Choose = Callable[[Codes], Actions]
 
-_BACKUPS = 100
+BACKUPS = 100
+_NUMBERS = 1 << 26  # of codes that are prepared at once: 256 MiB
 _TREES, _LEAF = 30, 8  # trees, and the fewest steps in a leaf
 _FEATURES, _PENALTY = 400, 1e-3
 _PAIRS = 500  # rows whose distances give the features their width
@@ -146,17 +147,29 @@ def q_iteration(values: Values, steps: Coded, gamma: float, tries: Actions) -> C
     """
 
     def prepared(codes: Codes) -> Any:
-        return values.prepare(np.repeat(codes, len(tries), axis=0), np.tile(tries, (len(codes), 1)))
+        parts = np.array_split(codes, -(-codes.size * len(tries) // _NUMBERS))
+        return np.concatenate(
+            [
+                values.prepare(np.repeat(part, len(tries), axis=0), np.tile(tries, (len(part), 1)))
+                for part in parts
+            ]
+        )
 
     def of_each(prepared: Any) -> Array:
         return values.at(prepared).reshape(-1, len(tries))
 
     next_code = prepared(steps.next_code)
-    backup(values, steps.held, gamma, lambda: of_each(next_code).max(axis=1))
+    backup(values, steps.held, gamma, lambda: of_each(next_code).max(axis=1), BACKUPS)
     return lambda codes: tries[of_each(prepared(codes)).argmax(axis=1)]
 
 
-def backup(values: Values, held: Transitions, gamma: float, ahead: Callable[[], Array]) -> None:
+def backup(
+    values: Values,
+    held: Transitions,
+    gamma: float,
+    ahead: Callable[[], Array],
+    times: int,
+) -> None:
     """Fit values to rewards and what comes after, again and again.
 
     Args:
@@ -164,12 +177,13 @@ def backup(values: Values, held: Transitions, gamma: float, ahead: Callable[[], 
         held: the steps.
         gamma: the discount of a held step.
         ahead: by the values of now, what comes after each step, (n,).
+        times: how often.
     """
     least, largest = held.reward.min() / (1 - gamma), held.reward.max() / (1 - gamma)
     if not held.continues.all():  # nothing comes after an end
         least, largest = min(least, 0.0), max(largest, 0.0)
     wanted = held.reward
-    for _ in range(_BACKUPS):
+    for _ in range(times):
         values.fit(wanted)
         wanted = held.reward + gamma * held.continues * np.clip(ahead(), least, largest)
     values.fit(wanted)

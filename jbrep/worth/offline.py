@@ -1,5 +1,6 @@
 """What is learned from stored steps through a code, and what acting by it returns."""
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ EPISODES = 20  # that are played, and again for steps of its own
 _GAMMA = 0.99  # of a control step
 _DECISIONS = 100  # in an episode of full length
 _EXPLORED = 0.2  # share of actions at random in steps of its own
+_CHOSEN = 500  # codes for which actions are chosen at once
+_LEFT = 0.01  # share of a discounted sum that backups may leave out
 _OWN_SEED = EVALUATION_SEED // 2
 
 
@@ -163,8 +166,11 @@ def _estimated(encoder: BaseEncoder, ground: Ground, choose: Choose) -> Score:
     """
     steps, task = _coded(encoder, ground.unseen), ground.task
     values = Trees(steps)
-    ahead = values.prepare(steps.next_code, choose(steps.next_code))
-    fitted.backup(values, steps.held, ground.gamma, lambda: values.at(ahead))
+    parts = np.array_split(steps.next_code, -(-len(steps.next_code) // _CHOSEN))
+    ahead = values.prepare(steps.next_code, np.concatenate([choose(part) for part in parts]))
+    until_still = math.ceil(math.log(_LEFT) / math.log(ground.gamma))
+    backups = max(fitted.BACKUPS, until_still)
+    fitted.backup(values, steps.held, ground.gamma, lambda: values.at(ahead), backups)
     starts = steps.code[steps.held.first]
     value = values.at(values.prepare(starts, choose(starts)))
     returns = value * (1 - ground.gamma) * task.max_episode_steps

@@ -1,6 +1,6 @@
 """Steps to learn control from: what was seen, done and earned, with actions that are held."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -68,18 +68,16 @@ def stored(data: Dataset, episodes: NDArray[np.int64], hold: int, limit: int) ->
     """
     data["reward"]  # says what to do if there are none
 
-    def opened() -> Iterator[_Episode]:
-        for number in episodes.tolist():
-            each = data.episode(number)
-            seen = np.concatenate((each["observation"], each.record["final_observation"][None]))
-            yield _Episode(seen, each["action"], each["reward"], bool(each.record["terminated"]))
-
-    found = list[Transitions]()
-    for each in opened():
-        if sum(map(len, found)) >= limit:
+    found, count = list[Transitions](), 0
+    for number in episodes.tolist():
+        if count >= limit:
             break
-        if len(each.reward) >= hold:
-            found.append(_held(each, data.task, hold))
+        if len(each := data.episode(number)) >= hold:
+            seen = np.concatenate((each["observation"], each.record["final_observation"][None]))
+            ended = bool(each.record["terminated"])
+            played = _Episode(seen, each["action"], each["reward"], ended)
+            found.append(_held(played, data.task, hold))
+            count += len(found[-1])
     if not found:
         raise InputError(
             f"no episode of {data.folder} has {hold} steps, for which an action is held: nothing "

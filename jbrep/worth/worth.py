@@ -15,7 +15,7 @@ from jbrep.evaluate.evaluation import EVALUATION, Evaluation, Learned, Worth
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
 from jbrep.study.tables import references_of
-from jbrep.training.trainer import single_torch_thread
+from jbrep.training.trainer import single_thread
 from jbrep.worth import AGENT, WORTH, agents, offline
 from jbrep.worth.offline import EPISODES, Ground
 
@@ -59,15 +59,16 @@ def work_out(
         kinds: keys of WORTH.
     """
     every = {FULL: find(FULL, data.task), **encoders}
-    with _lanes(data) as lanes, single_torch_thread():
-        found = _Found(evaluation, folder / EVALUATION, lanes is None)
+    path = folder / EVALUATION
+    with exclusive(path, beside=True), _lanes(data) as lanes, single_thread():
+        found = _Found(evaluation, path, lanes is None)
         missing = {
             way: new
             for kind in kinds
             for way in WORTH[kind]
             if (new := {label: every[label] for label in found.missing(way, every)})
         }
-        if missing and lanes:
+        if missing and lanes and not found.worth.references:
             played = references_of(data.task, EPISODES)
             found.keep(references={policy: float(each.mean()) for policy, each in played.items()})
         if missing.pop(AGENT, None):
@@ -107,8 +108,7 @@ class _Found:
         """Write what became known of the worth."""
         self.worth = self.worth.replace(**known)
         self.evaluation = self.evaluation.replace(worth=self.worth)
-        with exclusive(self._path, beside=True):
-            self.evaluation.write(self._path)
+        self.evaluation.write(self._path)
 
     def learned(self, way: str, known: Mapping[str, Learned]) -> None:
         """Write what a way of learning made of codes; the surest way stays the first."""

@@ -42,13 +42,13 @@ class Cohort:
         looks = self._shared.n_steps, self._shared.gamma
         capacity = capacity_of(job.run)
         self._replay = ReplayBuffer(len(members), self._lanes, capacity, *sizes, *looks)
-        lanes, repeat = len(members) * self._lanes, settings.hyperparameters.action_repeat
-        self._robots = AutoresetLanes(task, lanes, job.threads_for(lanes), repeat, job.retries)
         self._device = torch.device(settings.device)
         agents = [member.agent for member in members]
         self._stack = Stack(agents, self._size, settings.precision, settings.device)
         self._algorithm = get_algorithm(settings.algorithm)(self._stack)
         self._stack.read_from_agents()
+        lanes, repeat = len(members) * self._lanes, settings.hyperparameters.action_repeat
+        self._robots = AutoresetLanes(task, lanes, job.threads_for(lanes), repeat, job.retries)
         job.share(self._robots.lanes)
         self._observation = np.zeros((len(members), self._lanes, self._size), np.float32)
         self._episode_ended = False  # whether an episode has just ended
@@ -261,7 +261,8 @@ class Cohort:
         They lose their replay buffers: memory is enough for one replay buffer of each member.
         """
         for member, snapshot in zip(self.members, snapshots, strict=True):
-            member.restore(snapshot)
+            with member.job.checkpoint.resuming():
+                member.restore(snapshot)
         self._stack.read_from_agents()
         self.agent_step, self._n_updates = self._shared.num_timesteps, self._shared._n_updates
         tensors = [each.tensors for each in snapshots]

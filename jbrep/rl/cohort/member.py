@@ -28,6 +28,7 @@ from jbrep.rl.job import Job
 from jbrep.rl.noise import Memory, Noise, beginning
 from jbrep.rl.normalization import normalized
 from jbrep.rl.overrides import without_buffer
+from jbrep.rl.presets import parameters_of
 
 Indices = NDArray[np.int64]
 _LOG_EVERY = 4  # episodes, as in stable-baselines3
@@ -58,6 +59,9 @@ class Member:
         env = DummyVecEnv([lambda: Spaces(*agent_spaces(run.task, job.encoder))])
         normalizing = normalized(env) if chosen.normalize else env
         self.agent: Any = make_agent(settings.algorithm, small, normalizing, run.seed)
+        usual, _ = parameters_of(settings.algorithm)
+        size = chosen.algorithm_kwargs.get("buffer_size", usual["buffer_size"].default)
+        vars(self.agent)["buffer_size"] = size  # of policy.zip, which others may go on with
         self._normalizer: VecNormalize | None = self.agent.get_vec_normalize_env()
         steps = settings.episode_steps
         self.random = Random(self.agent.action_space, chosen.num_envs, chosen.noise, steps)

@@ -15,10 +15,12 @@ def capacity_of(run: Run) -> int:
     """The most transitions that a run keeps: no more than it makes, in whole rollouts."""
     chosen = run.learner.hyperparameters
     usual, _ = parameters_of(run.learner.algorithm)
-    size, steps = (
-        int(chosen.algorithm_kwargs.get(name, usual[name].default))
+    size, every = (
+        chosen.algorithm_kwargs.get(name, usual[name].default)
         for name in ("buffer_size", "train_freq")
     )
+    count, unit = (every, "step") if isinstance(every, int) else every
+    steps = count * (chosen.agent_steps(run.task.max_episode_steps) if unit == "episode" else 1)
     rollout = steps * chosen.num_envs
     return min(size, -(-chosen.agent_steps(run.steps) // rollout) * rollout)
 

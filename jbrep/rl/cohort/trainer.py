@@ -5,6 +5,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
 from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.rl.agent import unchecked_distributions
 from jbrep.rl.checkpoint import Snapshot, StoppedError
@@ -53,11 +54,14 @@ def _kind(job: Job, snapshot: Snapshot | None) -> _Kind:
 
 def _begin(cohort: Cohort, snapshots: Sequence[Snapshot]) -> None:
     """Begin anew, or go on from where the members' snapshots were taken, if there are any."""
-    if snapshots:
+    if not snapshots:
+        return cohort.begin()
+    try:
         with cohort.members[0].job.checkpoint.resuming():
-            cohort.restore(snapshots)
-    else:
-        cohort.begin()
+            return cohort.restore(snapshots)
+    except EnvironmentFailedError as error:
+        path = cohort.member_of(error.lane).job.checkpoint.path
+        raise InputError(f"{path} can't be resumed: {error}") from None
 
 
 def _train(begun: list[_Begun], session: Session) -> Iterator[Ended]:
