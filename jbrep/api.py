@@ -325,10 +325,9 @@ def train(
         InputError: an unknown name, or a value that can't be used; or another run is in the folder.
         StoppedError: `stop` was true.
     """
-    from joblib import cpu_count
-
     from jbrep.envs.description import as_task
     from jbrep.envs.make import is_batched
+    from jbrep.machine import cores
     from jbrep.rl.bar import Bar
     from jbrep.rl.job import Job, Session
     from jbrep.rl.run import Run
@@ -341,7 +340,7 @@ def train(
     run = Run.of(known, algorithm, preset, overrides, encoder=encoder, seed=seed, **settings)
     if is_one and run.learner.hyperparameters.num_envs > 1:
         run = run.replace(learner=run.learner.overridden({"num_envs": 1}))
-    job = Job(run, Path(out), threads or cpu_count(), retries, is_one)
+    job = Job(run, Path(out), threads or cores(), retries, is_one)
     if ended := job.result:
         _note(f"the run in {job.folder} had {ended.status} already: nothing was done")
     elif not known.reproducible:

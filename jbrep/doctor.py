@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 from packaging.requirements import Requirement
 
+from jbrep.machine import cores, memory
+
 EXTRAS = {  # what each extra is for; the empty name stands for the core
     "": "the robot and its environments, collect, data",
     "dm-control": "jbrep.jitterbug.load, which gives dm_control environments",
@@ -54,10 +56,9 @@ def examine() -> Iterator[Finding]:
     """Describe the machine, then the packages of each extra."""
     where = f"Python {platform.python_version()}, {platform.platform()}"
     yield Finding("jbrep", f"{version('jbrep')} on {where}")
-    yield Finding("cores", f"{_cores()}: collect steps robots on all, a study has a run on each")
+    yield Finding("cores", f"{cores()}: collect steps robots on all, a study has a run on each")
     if hasattr(os, "sysconf"):  # not on Windows
-        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        yield Finding("memory", f"{memory / 2**30:.0f} GiB")
+        yield Finding("memory", f"{memory() / 2**30:.0f} GiB")
     free = shutil.disk_usage(Path.cwd()).free
     yield Finding("disk", f"{free / 2**30:.0f} GiB free here; 5 million states take 0.4 to 1.9")
     yield Finding("GPU", _gpu())
@@ -66,14 +67,6 @@ def examine() -> Iterator[Finding]:
     yield Finding("Ray", address or "no RAY_ADDRESS: study --backend ray starts one of its own")
     for extra, purpose in EXTRAS.items():
         yield _packages(extra, purpose)
-
-
-def _cores() -> int:
-    try:
-        from joblib import cpu_count  # heeds affinity and a container's limits
-    except ModuleNotFoundError:
-        return os.cpu_count() or 1
-    return int(cpu_count())
 
 
 def _gpu() -> str:

@@ -22,7 +22,13 @@ from jbrep.collect.derive import derive
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
-from jbrep.dataset.manifest import current_manifest, open_shard, read_manifest, write_manifest
+from jbrep.dataset.manifest import (
+    commit,
+    current_manifest,
+    open_shard,
+    read_manifest,
+    write_manifest,
+)
 from jbrep.dataset.schema import episode_seed
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
@@ -262,6 +268,24 @@ def test_no_space_at_any_stage_of_a_commit(stage, count, collected, tmp_path, mo
         np.testing.assert_array_equal(
             dataset["reward"], Dataset(collected)["reward"][: len(dataset)]
         )
+    write_again(collected, folder)
+    assert contents(folder) == contents(collected)
+
+
+def test_what_is_being_committed_when_it_is_stopped_is_kept(collected, tmp_path, monkeypatch):
+    folder, calls = tmp_path / "data", []
+
+    def stopped(*arguments):
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise SystemExit
+        return commit(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(collecting, "commit", stopped)
+        with pytest.raises(SystemExit):
+            write_again(collected, folder)
+    assert len(Dataset(folder)) == 2000
     write_again(collected, folder)
     assert contents(folder) == contents(collected)
 

@@ -150,6 +150,17 @@ def test_a_shard_that_changes_while_it_is_open_is_checked_again(damage, copied):
             use()
 
 
+def test_a_shard_in_the_place_of_another_is_not_read(copied):
+    """Its bytes were checked, as those of the other."""
+    dataset = Dataset(copied)
+    dataset["reward"][:1000]
+    path = copied / "shard-00001.h5"
+    path.unlink()
+    os.link(copied / "shard-00000.h5", path)
+    with pytest.raises(DamageError, match=r"shard-00001\.h5 is damaged"):
+        dataset["reward"][1000]
+
+
 def test_a_shard_that_is_repaired_while_it_is_open_is_read_on(copied):
     dataset = Dataset(copied)
     rewards = dataset["reward"][:]

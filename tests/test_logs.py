@@ -407,6 +407,40 @@ def test_what_is_exported_to_lerobot_has_its_layout_and_comes_back(tmp_path):
     assert "the time step of table is not known: give it as timestep" in done.output
 
 
+@pytest.mark.filterwarnings("ignore:.*is near 1000000")
+@pytest.mark.parametrize("form", ["lerobot", "minari", "npz", "parquet"])
+def test_an_offset_is_taken_off_once(form, tmp_path):
+    """Of features that lack it already nothing, of others all."""
+    rows = {"t": np.arange(8) / 10, "x": 1e6 + np.arange(8) / 8, "u": np.full(8, 0.5)}
+    rows["reward"] = np.zeros(8)
+    layout = Layout(observations=("x",), actions=("u",), time="t")
+    plain = Dataset.from_table(tmp_path / "plain", rows, layout)
+    features = tmp_path / "features.toml"
+    features.write_text("[[features]]\noffset = 1000000\n")
+    path = write_csv(tmp_path / "a.csv", {name: values.tolist() for name, values in rows.items()})
+    how = ("--observations", "x", "--actions", "u", "--time", "t", "--features", features)
+    _, shifted = imported(path, *how, out="shifted")
+    np.testing.assert_array_equal(shifted["observation"][:, 0], np.arange(7) / 8)
+    for data in (plain, shifted):
+        out = tmp_path / f"{data.folder.name}.{form}"
+        assert jbrep("data", "export", data.folder, "--to", form, "--out", out).exit_code == 0
+        source = next(out.glob("*/*/data")).parent if form == "minari" else out
+        _, back = imported(source, "--features", features, out=f"{data.folder.name}-back")
+        assert back.task.offset.tolist() == [1e6]
+        seen = back["observation"][:, 0]
+        np.testing.assert_array_equal(seen, np.arange(7)[: len(seen)] / 8)
+
+
+def test_a_header_may_follow_many_comments_and_rows_may_all_be_apart(tmp_path):
+    path = tmp_path / "a.csv"
+    comments = "".join(f"# {number}\n" for number in range(300))
+    path.write_text(comments + "t,x,u\n0,1,2\n1,2,3\n2,2,3\n")
+    how = ("--observations", "x", "--actions", "u", "--time", "t")
+    assert len(imported(path, *how)[1]) == 2
+    told = mistake("data", "import", path, *how, "--gap", "0.5", "--out", tmp_path / "apart")
+    assert "has no episode with a step" in told
+
+
 def test_damaged_lerobot_data_sets_are_refused(tmp_path):
     folder = lerobot_folder(tmp_path / "new", "v4.0")
     done = jbrep("data", "import", folder, "--out", tmp_path / "out")

@@ -290,6 +290,26 @@ def test_what_fails_is_closed_kept_and_tried_again(tmp_path):
     assert closed(tmp_path)
 
 
+def test_a_robot_that_cannot_be_opened_at_once_again_is_tried_again(tmp_path, monkeypatch):
+    describe(arms.ID, {"log": str(tmp_path / "log")})
+    robot = arm(tmp_path, fails=[Arm.steps_of_all + 30])
+    busy, begin = iter([False, True]), Arm.__init__  # at first, and after the failure
+
+    def opened(self, *given, **named):
+        if next(busy, False):
+            raise OSError("port busy")
+        begin(self, *given, **named)
+
+    monkeypatch.setattr(Arm, "__init__", opened)
+    instances.close_all()
+    Arm.steps_of_all = 0
+    told = jbrep(
+        "collect", *robot, "--steps", 100, "--threads", 1, "--retries", 2, "--out", tmp_path / "d"
+    )
+    assert told.exit_code == 0, told.output
+    assert len(Dataset(tmp_path / "d")) == 100
+
+
 def test_an_episode_that_fails_each_time_ends_it_whatever_the_others_do():
     task = describe("Sledges/Broken-v0", {"how": "raises", "seed": 12}, 10)
     lanes = Lanes(task, 3, retries=Retries(1))

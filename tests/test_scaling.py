@@ -67,6 +67,14 @@ def test_scalings_are_their_formulas_also_of_constant_and_far_features(scaling, 
         assert 0.9 < np.abs(scaled[:, 2]).max() < 3
 
 
+def test_a_feature_that_is_nearly_always_the_same_is_no_constant():
+    rows = np.zeros((2001, 1), np.float32)
+    rows[::500] = 500  # a contact's force
+    some = make_task([make_feature("force")])
+    scaler = fit_scaler("robust", some, column(rows), np.arange(2001))
+    assert (scaler.low[0], scaler.high[0]) == (-500, 500)
+
+
 def test_a_task_without_usual_ranges_has_no_nominal_scaling():
     some = make_task([make_feature("known", low=0, high=1), make_feature("free")])
     with pytest.raises(InputError, match="Humanoid-v5 has no usual range of free: choose another"):

@@ -19,6 +19,7 @@ from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError, Notice
 from jbrep.evaluate.evaluation import Evaluation, Learned, Lost, Score
+from jbrep.play.rollout import replay
 from jbrep.play.sources import find_good_policy
 from jbrep.records.document import read_document
 from jbrep.records.lock import exclusive
@@ -361,6 +362,7 @@ def test_own_rewards_are_never_compared_with_those_of_the_environment(data, tmp_
     arguments = "--encoder", "pca-8", "--data", own, "--worth", "agent", "--out", tmp_path / "c"
     assert "gives other rewards" in mistake("evaluate", *arguments)
     assert not (tmp_path / "c").exists()  # nothing takes time before
+    assert replay(Dataset(own), 0).motion  # it is filmed and shown as the robot's
     assert find_good_policy(None, data.task, own_rewards=True) is None
     assert find_good_policy("heuristic", data.task, own_rewards=True).states is None
 

@@ -1,6 +1,5 @@
 """Where shards are made: in this process, in others on this machine, or on a Ray cluster."""
 
-import os
 import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -17,12 +16,13 @@ from jbrep.envs.make import is_batched
 from jbrep.envs.names import import_modules, imported_modules, spec_of
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, first_line
+from jbrep.machine import cores
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
 
 
 def local(simulator: Simulator) -> Produce:
     """A batch's shards in turn on threads; other environments' side by side in processes."""
-    workers = simulator.num_threads or os.cpu_count() or 1
+    workers = simulator.num_threads or cores()
     task = simulator.settings.task
     if is_batched(task) or workers == 1 or not _can_be_sent(spec_of(task), simulator):
         return simulator.in_turn

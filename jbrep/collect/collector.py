@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Generator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -57,7 +58,7 @@ def collect(
 ) -> Manifest:
     """Collect a data set, or what is missing of it.
 
-    Neither lanes, threads nor backend change a byte, nor does it whether a data set is collected at
+    The bytes depend neither on lanes, threads or backend, nor on whether a data set is collected at
     once or extended. Before one that is there is continued, an episode of it is played again: it
     must be the same to the last bit, where the environment is reproducible.
 
@@ -160,12 +161,15 @@ def _fill(
                 writing.commit(progress)
             if writing.remaining.rows <= 0:
                 break
-    except InputError as error:
-        if isinstance(error, DamageError) or not writing.commit(progress).episodes:
+        writing.commit(progress)
+    except BaseException as error:
+        with suppress(InputError):  # a full disk
+            writing.commit(progress)
+        is_damage = isinstance(error, DamageError)
+        if not isinstance(error, InputError) or is_damage or not writing.there.episodes:
             raise
         raise InputError(f"{error}; {writing.kept}") from None
     finally:
-        writing.commit(progress)
         if isinstance(pieces, Generator):
             pieces.close()
     return writing.remaining.manifest
@@ -178,11 +182,14 @@ class _Writing:
         folder: of the data set.
         there: its manifest so far, which counts until there is more.
         remaining: of the manifest that is wanted.
+
+    Attributes:
+        there: the manifest of what is written.
     """
 
     def __init__(self, folder: Path, there: Manifest, remaining: Remaining):
         self.remaining = remaining
-        self._folder, self._there = folder, there
+        self._folder, self.there = folder, there
         self._held: list[Columns] = []
         self._committed = time.monotonic()
 
@@ -217,25 +224,25 @@ class _Writing:
             or time.monotonic() - self._committed > _HOLD_SECONDS
         )
 
-    def commit(self, progress: Any) -> Manifest:
-        """Write what is held; the manifest of what is there then."""
+    def commit(self, progress: Any) -> None:
+        """Write what is held; it stays held until it is there."""
         if self._held:
-            if self.remaining.manifest.settings != self._there.settings:
+            if self.remaining.manifest.settings != self.there.settings:
                 write_manifest(self._folder, self.remaining.manifest)
-            held, self._held = joined(self._held), []
-            self._there = self.remaining.manifest = commit(
-                self._folder, self.remaining.manifest, held
-            )
+            now = current_manifest(self._folder)  # one that was interrupted may have got through
+            if now.episodes == self.remaining.manifest.episodes:
+                now = commit(self._folder, self.remaining.manifest, joined(self._held))
+            self.there = self.remaining.manifest = now
+            self._held = []
             self.remaining.held, self._committed = 0, time.monotonic()
-            progress.update(self._there.rows - progress.n)
-            size = sum(entry.bytes for entry in self._there.shards)
+            progress.update(self.there.rows - progress.n)
+            size = sum(entry.bytes for entry in self.there.shards)
             progress.set_postfix_str(f"{size / 1e6:,.0f} MB on disk", refresh=False)
-        return self._there
 
     @property
     def kept(self) -> str:
         """What is there, for a message."""
-        manifest = self._there
+        manifest = self.there
         return f"{counted(manifest.episodes, 'episode')} of {manifest.rows:,} rows are kept"
 
 
@@ -249,7 +256,7 @@ def _begin(settings: DataSettings, folder: Path, files: Mapping[str, bytes]) -> 
         if manifest != read_manifest(folder):
             write_manifest(folder, manifest)
         _keep(files, folder)
-        check_space(folder, (settings.steps - manifest.settings.steps) * settings.row_bytes())
+        check_space(folder, (settings.steps - manifest.rows) * settings.row_bytes())
     else:
         manifest = new_manifest(settings)
         check_space(folder, settings.steps * settings.row_bytes())

@@ -104,7 +104,8 @@ def simulate_again(
 def _is_equal(recording: Recording, lane: int, episode: Episode) -> bool:
     """Whether a lane went through what is stored of an episode, to the last bit."""
     length, stored = len(episode), episode.record
-    if recording.length[lane] < length:
+    ends_there = recording.length[lane] == length and bool(recording.terminated[lane])
+    if recording.length[lane] < length or ends_there != bool(stored["terminated"]):
         return False
     pairs: list[tuple[Any, Any]] = []
     if not episode.dataset.manifest.settings.reward:  # or else the environment gives others

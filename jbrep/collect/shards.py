@@ -146,6 +146,7 @@ class Simulator:
         def at_once() -> int:
             return min(most, math.ceil(min(wanted() / longest, len(episodes))))
 
+        has_failed = False
         while (size := at_once()) > 0:
             try:
                 with Lanes(self.settings.task, size, self.num_threads) as lanes:
@@ -154,7 +155,10 @@ class Simulator:
                         retries.succeeded()
                         episodes = episodes[size:]
                         yield columns
-            except EnvironmentFailedError as error:
+            except InputError as error:
+                if not (has_failed or isinstance(error, EnvironmentFailedError)):
+                    raise  # it could never be made
+                has_failed = True
                 retries.failed(error)
 
     def _simulate(self, episodes: Array, lanes: Lanes, tick: Tick) -> Columns:

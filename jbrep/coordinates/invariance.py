@@ -44,9 +44,11 @@ def check_invariant(coordinates: Coordinates) -> None:
         InputError: they change, or it can't be tried.
     """
     task = coordinates.task
-    envs = [make_env(task.id, task.arguments, task.max_episode_steps) for _ in range(2)]
+    envs: list[gymnasium.Env[Any, Any]] = []
     names, compared = (*coordinates.names, "the reward"), 0
     try:
+        for _ in range(2):
+            envs.append(make_env(task.id, task.arguments, task.max_episode_steps))
         for seed in range(_SEEDS):
             for observations, rewards in _played(envs, task, seed):
                 seen = np.column_stack((coordinates.forward(observations), rewards))

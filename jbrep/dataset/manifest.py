@@ -13,7 +13,7 @@ from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
 from jbrep.dataset.settings import Digest
 from jbrep.dataset.shard import (
     REPAIR,
-    FileState,
+    Checked,
     Shard,
     column_hashes,
     file_hash,
@@ -255,7 +255,7 @@ def _is_empty_backup(folder: Path) -> bool:
 
 
 def open_shard(
-    folder: Path, manifest: Manifest, shard: int, checked: set[FileState] | None = None
+    folder: Path, manifest: Manifest, shard: int, checked: set[Checked] | None = None
 ) -> Shard:
     """Open a shard once its bytes have been checked against the manifest.
 
@@ -263,8 +263,8 @@ def open_shard(
         folder: of the data set.
         manifest: with the size and the hash of the shard.
         shard: its number.
-        checked: states of files that have been checked before; this one's is added. A file in one
-            of these states isn't hashed again.
+        checked: shards that have been checked before, with the states that their files were in;
+            this one is added. A file in one of these states isn't hashed again.
 
     Raises:
         DamageError: the bytes differ, or the file is missing.
@@ -272,14 +272,14 @@ def open_shard(
     path, entry = folder / shard_name(shard), manifest.shards[shard]
     state = file_state(path)  # before it is mapped: a file replaced in between is hashed again
     content = map_file(path)
-    if checked is None or state not in checked:
+    if checked is None or (shard, state) not in checked:
         if len(content) != entry.bytes or file_hash(content) != entry.xxh3:
             raise DamageError(
                 f"{path} is damaged: its content isn't what was committed: its checksum doesn't "
                 f"match; {REPAIR}"
             )
         if checked is not None:
-            checked.add(state)
+            checked.add((shard, state))
     specs, most = manifest.settings.specs(), manifest.task.max_episode_steps
     return Shard(path, content, specs, entry.rows, entry.episodes, most)
 

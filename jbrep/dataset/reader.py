@@ -23,7 +23,7 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.scaling import EXTREMA, Scaler, fit_scaler
 from jbrep.dataset.schema import EPISODES, Columns, episode_bounds, episode_columns
-from jbrep.dataset.shard import FileState, file_state
+from jbrep.dataset.shard import Checked, FileState, file_state
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
 
@@ -99,7 +99,7 @@ class Dataset:
         self.manifest = current_manifest(self.folder)
         check_files(self.folder, self.manifest, files)
         self.task = self.manifest.task
-        self._checked: set[FileState] = set()
+        self._checked: set[Checked] = set()
         self._opened = lru_cache(_open_at_once())(self._open)
         self._ends = list(accumulate(entry.rows for entry in self.manifest.shards))
         self._specs = self.manifest.settings.step_specs()

@@ -191,7 +191,8 @@ def _robust(values: _Values, rows: Rows) -> Range:
     step = -(-len(rows) // _SAMPLED)
     sampled = np.concatenate(list(values.parts(rows[::step])))
     low, median, high = np.quantile(sampled.astype(np.float64), _QUANTILES, axis=0)
-    half_width = (high - low) / 2
+    farthest = np.abs(sampled - median).max(axis=0)  # where nearly all rows are the same
+    half_width = np.where(low == high, farthest, (high - low) / 2)
     return median - half_width, median + half_width
 
 

@@ -20,6 +20,7 @@ from jbrep.records.storage import open_regular
 
 REPAIR = "run jbrep data repair to restore it"
 FileState = tuple[int, ...] | None  # see `file_state`
+Checked = tuple[int, FileState]  # a shard, and the state in which its file was as it should be
 _HASH = "sha256"  # attribute of every column
 
 

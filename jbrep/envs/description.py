@@ -81,7 +81,8 @@ def describe(
             f"max_episode_steps is no argument of {spec.id}: --episode-steps sets the time limit"
         )
     files = files_of({**spec.kwargs, **given})
-    key = (spec.entry_point, tuple(files.items()))
+    registered = spec.max_episode_steps, spec.reward_threshold, repr(spec.kwargs)
+    key = (spec.entry_point, registered, tuple(files.items()))
     text = json.dumps(absolute(given), sort_keys=True)
     task, signals = _describe(name, text, max_episode_steps, key)
     written = files_of({**spec.kwargs, **given})  # by the environment itself, such as a log

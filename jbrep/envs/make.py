@@ -39,28 +39,40 @@ def make_env(
     spec = find_spec(env_id)
     if max_episode_steps is not None:
         options["max_episode_steps"] = max_episode_steps  # None would lift the registered limit
+    with _making(env_id, arguments):
+        return gymnasium.make(spec, disable_env_checker=True, **{**arguments, **options})
+
+
+def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:
+    """All lanes as one environment that steps them together, see `is_batched`.
+
+    Raises:
+        InputError: it can't be made; the message says why.
+    """
+    with _making(task.id, task.arguments):
+        return gymnasium.make_vec(
+            spec_of(task),
+            num_envs=num_lanes,
+            vectorization_mode="vector_entry_point",
+            autoreset_mode=AutoresetMode.DISABLED,
+            max_episode_steps=task.max_episode_steps,
+            num_threads=num_threads,
+            dtype="float64",
+            **task.arguments,
+        )
+
+
+@contextmanager
+def _making(env_id: str, arguments: Mapping[str, Any]) -> Iterator[None]:
+    """Say in a line why an environment can't be made."""
     try:
         with _quiet(), aside():
-            return gymnasium.make(spec, disable_env_checker=True, **{**arguments, **options})
+            yield
     except InputError:
         raise
     except Exception as error:
         given = f" with {dict(arguments)}" if arguments else ""
         raise InputError(f"can't make {env_id}{given}: {reason(error)}") from error
-
-
-def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:
-    """All lanes as one environment that steps them together, see `is_batched`."""
-    return gymnasium.make_vec(
-        spec_of(task),
-        num_envs=num_lanes,
-        vectorization_mode="vector_entry_point",
-        autoreset_mode=AutoresetMode.DISABLED,
-        max_episode_steps=task.max_episode_steps,
-        num_threads=num_threads,
-        dtype="float64",
-        **task.arguments,
-    )
 
 
 def is_batched(task: Task) -> bool:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from joblib import cpu_count
 from msgspec import UNSET, UnsetType
 
 from jbrep.dataset import Dataset, ScaledDataset
@@ -24,6 +23,7 @@ from jbrep.evaluate.evaluation import EVALUATION, KEPT, Diagnostics, Evaluation,
 from jbrep.evaluate.held_out import HeldOut, Rows
 from jbrep.evaluate.reconstruction import corruption, reconstruction
 from jbrep.evaluate.regression import Networks, beside, fit
+from jbrep.machine import cores
 from jbrep.progress import Progress
 from jbrep.records.document import read_document
 from jbrep.records.lock import exclusive
@@ -154,7 +154,7 @@ def _side_by_side(
         learnt = networks(full, held_out, policy)
         return learnt, needs(full, held_out, policy, learnt)
 
-    with single_thread(), ThreadPoolExecutor(cpu_count()) as pool:
+    with single_thread(), ThreadPoolExecutor(cores()) as pool:
         begun = pool.submit(begin)
         total = len(encoders) * len(_DIAGNOSTICS)
         with Progress(total=total, unit="diagnostic") as progress:

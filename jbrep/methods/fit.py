@@ -27,6 +27,7 @@ from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, inside, make_folder
 from jbrep.training import checkpoint
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method
+from jbrep.training.network import check_layers
 from jbrep.training.trainer import (
     Epoch,
     Schedule,
@@ -150,9 +151,12 @@ class Fitter:
         name = name or name_of(method)
         check_name(name)
         method.check_data(data)
-        if isinstance(method, Learned) and not method.batch_size:
-            windows = count_windows(data, method.objective(data).horizon)
-            method = method.replace(batch_size=default_batch_size(windows))
+        if isinstance(method, Learned):
+            objective = method.objective(data)
+            check_layers(*objective.layers())
+            if not method.batch_size:
+                windows = count_windows(data, objective.horizon)
+                method = method.replace(batch_size=default_batch_size(windows))
         plan = Plan(method, data, _header(method, name, data), self._folder / f"{name}{SUFFIX}")
         plan.find()  # another encoder there is a mistake
         return plan

@@ -56,7 +56,10 @@ def exported_player(path: Path, task: Task | None = None) -> Player:
     """
     session, said = read_exported(path)
     known = task or said.environment
-    (given,), (made,) = session.get_inputs(), session.get_outputs()
+    ends = session.get_inputs(), session.get_outputs()
+    if any(len(end) != 1 or len(end[0].shape) != 2 for end in ends):
+        raise InputError(f"{path} isn't a policy that jbrep policy export wrote")
+    (given,), (made,) = ends
     sizes = given.shape[1], made.shape[1]
     if sizes != (known.size, known.action_size):
         raise InputError(
@@ -65,7 +68,10 @@ def exported_player(path: Path, task: Task | None = None) -> Player:
         )
 
     def act(observation: Array) -> NDArray[Any]:
-        (action,) = session.run([made.name], {given.name: observation.astype("float32")})
+        try:
+            (action,) = session.run([made.name], {given.name: observation.astype("float32")})
+        except Exception as error:  # of several classes
+            raise InputError(f"{path} can't be run: {first_line(error)}") from None
         return action
 
     def begin(task: Task, seeds: Any) -> Actor:

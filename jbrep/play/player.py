@@ -115,8 +115,8 @@ class Player(NamedTuple):
 
         Args:
             count: of episodes.
-            threads: to step a batch on; 1 is one instance of other environments, which are also
-                played in one where no second can be made.
+            threads: to step a batch on, or instances of other environments, which are also played
+                in one where no second can be made.
             retries: how often in a row an episode in which the environment fails is played again.
 
         Raises:
@@ -129,7 +129,9 @@ class Player(NamedTuple):
         self, count: int, threads: int | None = None, retries: int = 0
     ) -> Iterator[Outcome]:
         """The same with what `info` tells, some episodes at a time, as they are finished."""
-        most = _BATCH_LANES if is_batched(self.task) else 1 if threads == 1 else _SEPARATE_LANES
+        most = _BATCH_LANES
+        if not is_batched(self.task):
+            most = min(threads or _SEPARATE_LANES, _SEPARATE_LANES)
         check_episodes(count)
         played = 0
         with _progress(count * self.task.max_episode_steps) as bar:

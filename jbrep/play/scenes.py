@@ -102,8 +102,12 @@ class Drawn:
             lanes = Lanes(self._task, 1)
         except InputError as error:
             raise self._not_drawn(str(error)) from error
-        lanes.reset([0], [self._rollout.seed])
-        self._check_same(lanes, 0)
+        try:
+            lanes.reset([0], [self._rollout.seed])
+            self._check_same(lanes, 0)
+        except BaseException:
+            lanes.close()
+            raise
         return lanes
 
     def _check_same(self, lanes: Lanes, state: int) -> None:

@@ -1,7 +1,6 @@
 """What a user names: an episode of a data set, the policy of a run, or one by its name."""
 
 from collections.abc import Callable, Mapping
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,7 +70,7 @@ def find_policy(text: str, folder: Path, task: Task) -> Policy:
         InputError: it names nothing of these, or what it names can't be used.
         DamageError: a file isn't what was written.
     """
-    files = (f"policy-{number}.safetensors" for number in count())
+    taken: list[str] = []
 
     def frozen(part: str) -> Policy | None:
         by_name = part.partition(":")[0] in POLICIES
@@ -79,11 +78,13 @@ def find_policy(text: str, folder: Path, task: Task) -> Policy:
             return None
         from jbrep.rl.frozen import freeze, kept  # imports torch
 
-        file, run = next(files), run_folder(part)
+        file, run = f"policy-{len(taken)}.safetensors", run_folder(part)
         source = str(run or part)
-        if found := kept(source, folder / file):  # it stays, even if the run has gone on since
-            return found
-        return freeze(source, run or policy_file(part, task), file) if is_trained(part) else None
+        found = kept(source, folder / file)  # it stays, even if the run has gone on since
+        if not found and is_trained(part):
+            found = freeze(source, run or policy_file(part, task), file)
+        taken.extend([file] if found else [])
+        return found
 
     return parse_policy(text, frozen)
 

@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import io
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -91,8 +92,13 @@ def read_rows(path: Path, kind: type[_Row], sha256: str | None = None) -> list[_
 
 def _cell(value: str | float) -> str | int:
     if isinstance(value, float):
-        return f"{value:.3f}"
+        return f"{value:.6g}" if 0 < abs(value) < 1 else f"{value:.3f}"
     return value if isinstance(value, str) else int(value)
+
+
+def rounded(value: float) -> float:
+    """A number as tables have it: three decimals, or six digits of one below 1."""
+    return float(_cell(float(value)))
 
 
 def _column(field: str) -> str:
@@ -118,6 +124,6 @@ def finite(cell: str) -> float:
         ValueError: it is something else, or infinite.
     """
     number = float(cell)
-    if not abs(number) <= _MOST:
+    if not math.isfinite(number):
         raise ValueError
     return number

@@ -21,6 +21,7 @@ from jbrep.records.container import Tensors
 from jbrep.records.document import Document, document_from
 from jbrep.records.record import Version, shown
 from jbrep.records.storage import exists
+from jbrep.records.tables import rounded
 from jbrep.rl.agent import parameters, restore_statistics, statistics_of
 from jbrep.rl.files import CHECKPOINT, RUN, Episode, Evaluation, Info, read_run
 from jbrep.rl.run_settings import RunSettings
@@ -77,11 +78,11 @@ class History:
 
     def evaluated(self, step: int, outcome: Outcome) -> None:
         """Record an evaluation after so many steps."""
-        rounded = outcome.returns.round(3).tolist()
-        self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(rounded)]
+        returns = [rounded(each) for each in outcome.returns]
+        self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(returns)]
         told = enumerate(outcome.numbers)
         self.infos += [Info(step, i, *each) for i, numbers in told for each in numbers.items()]
-        self.means.append(float(np.mean(rounded)))
+        self.means.append(float(np.mean(returns)))
 
     def forget_from(self, step: int) -> None:
         """Forget the evaluations after so many steps, or more."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
-from joblib import cpu_count
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 from torch.utils.tensorboard import SummaryWriter
@@ -20,6 +19,7 @@ from jbrep.envs.infos import by_name
 from jbrep.envs.lanes import Lanes, lanes_at_once
 from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError
+from jbrep.machine import cores
 from jbrep.records.commit import commits
 from jbrep.records.storage import exists, inside, read_file, write_whole
 from jbrep.records.tables import write_rows
@@ -118,7 +118,7 @@ class Job:
     def threads_for(self, lanes: int) -> int:
         """How many threads step so many of its robots; no bit depends on it."""
         is_alone = self.settings.device != CPU  # studies have a process for each core otherwise
-        return min(cpu_count() if is_alone else self.threads, lanes)
+        return min(cores() if is_alone else self.threads, lanes)
 
     @property
     def result(self) -> RunRecord | None:

@@ -1,18 +1,17 @@
 """Which runs of a study go on together, to keep all workers busy, and how long that takes."""
 
 import heapq
-import os
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from joblib import cpu_count
 
 from jbrep.encoders import FULL
 from jbrep.envs.names import is_code
 from jbrep.errors import InputError
+from jbrep.machine import cores, memory
 from jbrep.progress import Progress
 from jbrep.rl import Run
 from jbrep.rl.cohort.replay import memory_of
@@ -36,7 +35,7 @@ _OF_WORKER, _OF_AGENT = 1 << 29, 1 << 25  # bytes that they take besides
 
 def usual_workers(plan: Plan) -> int:
     """How many packs go on at a time: one for each core, or one that has a GPU and all cores."""
-    return cpu_count() if plan.device == CPU else 1
+    return cores() if plan.device == CPU else 1
 
 
 def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
@@ -91,9 +90,8 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
 
 def _most(plan: Plan, cell: Cell, observed: int, workers: int) -> int:
     """How many runs like this one memory holds, for each worker."""
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") * _SHARE
     of_each = memory_of(plan.run(cell), observed)
-    return int((memory / workers - _OF_WORKER) // (of_each + _OF_AGENT))
+    return int((_SHARE * memory() / workers - _OF_WORKER) // (of_each + _OF_AGENT))
 
 
 def _observed(plan: Plan, cell: Cell) -> int:

@@ -23,7 +23,7 @@ from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.play.sources import find_player
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
-from jbrep.records.tables import read_rows, write_csv
+from jbrep.records.tables import read_rows, rounded, write_csv
 from jbrep.stats.scale import CONSTANT, LOOKING, RANDOM, STILL
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.text import slug
@@ -191,8 +191,7 @@ def _played(task: Task, policy: str, episodes: int) -> list[_Reference]:
         returns = find_player(_POLICIES[policy], task).returns(episodes)
     except Exception:  # reports don't need the environments, whatever these lack
         return []
-    rounded = (round(float(each), 3) for each in returns)
-    return [_Reference(task.name, policy, *row) for row in enumerate(rounded)]
+    return [_Reference(task.name, policy, i, rounded(each)) for i, each in enumerate(returns)]
 
 
 def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:

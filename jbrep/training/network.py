@@ -1,7 +1,7 @@
 """Networks of dense layers: the paper's, and others."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -92,6 +92,22 @@ def check_size(name: str, size: int, latent: int) -> None:
         raise InputError(
             f"architecture {architecture.name} has weights of {needed:,} bytes with {size} "
             f"features: an encoder's file has at most {MAX_BYTES:,}; choose smaller sizes"
+        )
+
+
+def check_layers(*parts: Sequence[Layer] | None) -> None:
+    """Make sure that layers fit an encoder's file.
+
+    Raises:
+        InputError: they are too large.
+    """
+    every = [layer for part in parts for layer in part or ()]
+    needed = _BYTES * sum(layer.weight.size + layer.bias.size for layer in every)
+    widest = max((len(layer.bias) for layer in every), default=0)
+    if needed > MAX_BYTES or widest > MAX_UNITS:
+        raise InputError(
+            f"its layers have {needed:,} bytes and up to {widest:,} units: an encoder's file has "
+            f"at most {MAX_BYTES:,} and {MAX_UNITS:,}; choose a smaller latent size"
         )
 
 

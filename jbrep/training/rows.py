@@ -1,15 +1,14 @@
 """The rows that a network is trained on, in memory or on disk, and the order of an epoch."""
 
-import os
 from collections.abc import Callable
-from contextlib import suppress
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from jbrep.machine import free_memory
 
 Load = Callable[[NDArray[np.int64]], NDArray[np.float32]]
 
@@ -30,20 +29,10 @@ def available_memory(device: torch.device) -> int:
 
     Rows for a GPU pass through the machine's memory, so they must fit in half of both.
     """
-    memory = max(_free() // 2, _LEAST_MEMORY)
+    memory = max(free_memory() // 2, _LEAST_MEMORY)
     if device.type == "cuda":
         memory = min(memory, torch.cuda.mem_get_info(device)[0] // 2)
     return memory
-
-
-def _free() -> int:
-    """Bytes that can be had without swapping; all that there are where the system doesn't say."""
-    with suppress(OSError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            name, _, kilobytes = line.partition(":")
-            if name == "MemAvailable":  # also what only caches files
-                return int(kilobytes.split()[0]) << 10
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def rows_of(

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib import cpu_count
 
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError, Notice
 from jbrep.evaluate.evaluation import Score, score
+from jbrep.machine import cores
 from jbrep.progress import Progress
 from jbrep.rl.files import FAILED, RunRecord, last_returns, read_evaluations
 from jbrep.rl.job import Job, Session
@@ -51,7 +51,7 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
                 final_episodes=EPISODES,
             ),
             folder / slug(label)[-100:] / f"seed-{seed}",
-            cpu_count(),
+            cores(),
         )
         for label, encoder in encoders.items()
         for seed in range(RUNS)

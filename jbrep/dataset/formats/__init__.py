@@ -41,7 +41,7 @@ _ALIKE = {  # what data that are imported together have in common
     "features": "has other features than",
     "has_rewards": "has rewards, or none, unlike",
     "action_bounds": "has other bounds of actions than",
-    "is_shifted": "has offsets of features subtracted, or not, unlike",
+    "subtracted": "has other offsets of features subtracted than",
 }
 _CLOCKS = 0.01  # by which even clocks may differ
 

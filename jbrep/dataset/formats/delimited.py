@@ -72,19 +72,21 @@ def _line_of(path: Path, begin: int, row: int) -> int:
 def _form(path: Path) -> _Form:
     try:
         with path.open(encoding="utf-8-sig", newline=None) as file:
-            lines = [line.rstrip("\n") for line in islice(file, _PEEKED)]
+            numbered = enumerate(line.rstrip("\n") for line in file)
+            start = next(((i, s) for i, s in numbered if s.strip() and s[0] not in _COMMENTS), None)
+            lines = [line for _, line in islice(numbered, _PEEKED)]
     except UnicodeDecodeError:
         raise InputError(f"{path} can't be read as text: it must be in UTF-8") from None
     except OSError as error:
         raise InputError(f"{path} can't be read: {error.strerror}") from None
-    begin = next((i for i, s in enumerate(lines) if s.strip() and s[0] not in _COMMENTS), None)
-    if begin is None:
+    if start is None:
         raise InputError(f"{path} is empty: its first line must name the columns")
-    separator = max(_SEPARATORS, key=lines[begin].count)
+    begin, names_line = start
+    separator = max(_SEPARATORS, key=names_line.count)
     try:
         header, *rows = (
             [cell.strip() for cell in cells]
-            for cells in csv.reader(lines[begin:], delimiter=separator)
+            for cells in csv.reader([names_line, *lines], delimiter=separator)
         )
     except csv.Error as error:
         raise InputError(f"{path} can't be read as rows of text: {error}") from None

@@ -62,7 +62,7 @@ class Source:
         why_no_task: for the user.
         rows: how many there are, if that is known.
         has_rewards: whether they are known.
-        is_shifted: whether the offsets of features are subtracted from observations already.
+        subtracted: offsets of features that observations lack already, (d,) or 0.
         timestep: for a task made from the data alone [s].
         notes: what is done to its columns, for the user.
         changes: what was done to the rows that were read last, how often: what it is, and what
@@ -79,7 +79,7 @@ class Source:
     why_no_task: str = "it names no environment"
     rows: int | None = None
     has_rewards: bool = True
-    is_shifted: bool = False
+    subtracted: Array | float = 0.0
     timestep: float | None = None
     notes: tuple[str, ...] = ()
     changes: Callable[[], Mapping[tuple[str, str], int]] = dict

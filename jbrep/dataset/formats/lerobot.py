@@ -30,6 +30,7 @@ _VERSIONS = ("v3", "v2")
 _FILE_ROWS = 1 << 20  # of what is written
 _CHUNK_FILES = 1000
 _IMAGES = ("image", "video")
+_OFFSETS = "feature_offsets"  # of jbrep's own
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _NUMBERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
@@ -72,6 +73,7 @@ def open_table(given: str) -> Table:
         rows=rows,
         layout=Layout(observations=tuple(seen), actions=("action",)),
         timestep=1 / info["fps"],
+        subtracted=info["offsets"],
         notes=(f"images are left out: {', '.join(images)}",) if images else (),
     )
 
@@ -85,13 +87,14 @@ def _info(path: Path) -> dict[str, Any]:
         frames = int(info["total_frames"]) if "total_frames" in info else None
         known = {str(name): dict(each) for name, each in info["features"].items()}
         known = {name: each | {"dtype": str(each["dtype"])} for name, each in known.items()}
+        offsets = np.array(info.get(_OFFSETS, 0.0), np.float64)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{path} isn't as LeRobot writes it: {kind_and_line(error)}") from None
     if not version.startswith(_VERSIONS):
         raise InputError(f"{path} is of LeRobot's layout {version}: it must be v3.0 or v2.1")
     if not 0 < fps < np.inf:
         raise InputError(f"{path} has {fps} frames a second")
-    return {"fps": fps, "frames": frames, "features": known}
+    return {"fps": fps, "frames": frames, "features": known, "offsets": offsets}
 
 
 def _named(schema: pa.Schema, known: Mapping[str, Any]) -> pa.Schema:
@@ -231,5 +234,6 @@ def _write_meta(dataset: Dataset, folder: Path, files: list[int], fps: float) ->
         "data_path": _DATA,
         "video_path": None,
         "features": _features(dataset),
+        _OFFSETS: dataset.task.offset.tolist(),
     }
     write_whole(folder / INFO, json.dumps(info, indent=4).encode())

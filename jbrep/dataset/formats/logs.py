@@ -70,7 +70,7 @@ def source_of_table(table: Table, given: Layout | None = None, missing: str = ""
         features=() if table.task else features,
         rows=None if layout.rate else table.rows,
         has_rewards="reward" in roles,
-        is_shifted=table.task is not None,
+        subtracted=table.subtracted if table.task is None else table.task.offset,
         timestep=1 / layout.rate if layout.rate else table.timestep or reader.timestep,
         notes=reader.notes(),
         changes=reader.changes,

@@ -38,6 +38,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, kind_and_line, listed
 from jbrep.progress import Progress
 from jbrep.records.document import Document, read_document
+from jbrep.records.record import Finite
 from jbrep.records.storage import (
     exists,
     inside,
@@ -58,12 +59,13 @@ EPISODE_BYTES = 1 << 14  # that HDF5 takes for each episode besides its rows
 
 
 class Checksums(Document, frozen=True, kw_only=True):
-    """jbrep.json: the SHA-256 of each file that was exported, by its name."""
+    """jbrep.json: the SHA-256 of each file that was exported, by its name, and offsets, (d,)."""
 
     format = "jbrep export"
     format_version = 1
 
     files: Mapping[str, Digest]
+    offsets: tuple[Finite, ...] = ()
 
 
 def open_source(given: str) -> Source:
@@ -77,7 +79,7 @@ def open_source(given: str) -> Source:
         DamageError: it isn't what jbrep exported.
     """
     folder = _folder(given)
-    _check_files(folder)
+    exported = _check_files(folder)
     metadata = _metadata(folder)
     storage = _storage(given, folder)
     name = f"Minari {metadata.get('dataset_id', given)}"
@@ -97,6 +99,7 @@ def open_source(given: str) -> Source:
         action_bounds=(actions.low.ravel(), actions.high.ravel()),
         max_episode_steps=limit,
         why_no_task=why_not,
+        subtracted=np.array(exported.offsets) if exported and exported.offsets else 0.0,
     )
 
 
@@ -121,8 +124,8 @@ def _folder(given: str) -> Path:
     )
 
 
-def _check_files(folder: Path) -> None:
-    """Make sure that all files are plain ones inside the folder, and as jbrep exported them.
+def _check_files(folder: Path) -> Checksums | None:
+    """Make sure that all files are plain ones inside the folder, and as jbrep exported them, if so.
 
     Raises:
         InputError: one isn't, or leads out of the folder, or holds more than it has bytes for.
@@ -132,8 +135,9 @@ def _check_files(folder: Path) -> None:
         kind = path.lstat().st_mode
         if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
             raise InputError(f"{path} must be a plain file: no link, pipe or device is opened")
-    if exists(folder / _CHECKSUMS):
-        for name, sha256 in read_document(folder / _CHECKSUMS, Checksums).files.items():
+    known = read_document(folder / _CHECKSUMS, Checksums) if exists(folder / _CHECKSUMS) else None
+    if known:
+        for name, sha256 in known.files.items():
             if _sha256(inside(folder, name)) != sha256:
                 raise DamageError(
                     f"{folder / name} is damaged: it isn't what was exported, by its checksum; "
@@ -142,6 +146,7 @@ def _check_files(folder: Path) -> None:
     for path in sorted(folder.rglob("*.hdf5")):
         with opened(path, whole=True):
             pass
+    return known
 
 
 def _sha256(path: Path) -> str:
@@ -270,13 +275,14 @@ def write(dataset: Dataset, out: Path) -> str:
     settings = dataset.manifest.settings
     name = f"{_namespace(settings.task)}/{settings.policy['kind']}-v0"
     path, spec = inside(out, name), _env_spec(settings)
+    dataset["reward"]  # says what to do if there are none
     make_folder(path.parent)
     with unfinished(path) as root:  # Minari ignores hidden folders
         root.mkdir()
         with _datasets_in(root.resolve()), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on the missing author and address
             _create(dataset, name, spec)
-        _write_checksums(root / name / "data")
+        _write_checksums(root / name / "data", dataset.task)
         for namespace in Path(name).parents[:-1]:
             metadata = namespace / NAMESPACE_METADATA_FILENAME
             if not exists(out / metadata):
@@ -285,9 +291,10 @@ def write(dataset: Dataset, out: Path) -> str:
     return f"{_ROOT}={out} and minari.load_dataset({name!r})"
 
 
-def _write_checksums(folder: Path) -> None:
+def _write_checksums(folder: Path, task: Task) -> None:
     files = {path.name: _sha256(path) for path in sorted(folder.iterdir())}
-    Checksums(files=files).write(folder / _CHECKSUMS)
+    offsets = tuple(task.offset.tolist()) if task.offset.any() else ()
+    Checksums(files=files, offsets=offsets).write(folder / _CHECKSUMS)
 
 
 def _namespace(task: Task) -> str:

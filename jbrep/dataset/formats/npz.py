@@ -29,7 +29,7 @@ _DAMAGE = (  # what zipfile and NumPy raise at damaged files, and encrypted ones
     *(ValueError, TypeError, KeyError, OSError, EOFError, RuntimeError),
     *(NotImplementedError, zipfile.BadZipFile, zlib.error),
 )
-_LENGTHS = "episodes/length"  # which only jbrep writes
+_OFFSETS = "feature_offsets"  # which only jbrep writes: subtracted from observations, (d,)
 _ONCE = {  # what is known once for each episode
     "final_observation": ("episodes/final_observation", "final_observations"),
     "terminated": ("episodes/terminated",),
@@ -103,6 +103,7 @@ def open_source(given: str) -> Source:
         check_arrays(given, {column: stored[name] for column, name in own.items()})
         known = per_episode(given, _once(archive, stored))
         features = _features(archive, stored)
+        offsets = _whole(archive, _OFFSETS) if _OFFSETS in stored else 0.0
     return Source(
         given,
         label(path.stem),
@@ -110,7 +111,7 @@ def open_source(given: str) -> Source:
         features=features,
         rows=math.prod(stored[own["action"]].shape[:1]),
         has_rewards="reward" in own,
-        is_shifted=_LENGTHS in stored,
+        subtracted=offsets,
     )
 
 
@@ -193,6 +194,7 @@ def _write_zip(dataset: Dataset, path: Path, name: str) -> None:
     arrays = {f"episodes/{name}": values for name, values in dataset.episodes.items()}
     arrays["feature_names"] = np.array(dataset.task.feature_names)
     arrays["feature_units"] = np.array([feature.unit for feature in dataset.task.features])
+    arrays[_OFFSETS] = dataset.task.offset
     with zipfile.ZipFile(path, "w", allowZip64=True) as archive:
         for column_name in Progress(dataset.columns, unit="column", desc=name):
             column = dataset[column_name]

@@ -32,7 +32,6 @@ _WORDS = (
     pa.types.is_dictionary,
 )
 _TIMES = pa.types.is_timestamp, pa.types.is_duration
-_ONCE = ("reward", "time", "episode", "terminated")  # of a layout: one column each
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Table:
         batches: of some columns by name, from the first row on at each call.
         rows: how many there are, if that is known.
         layout: what its format says of its columns.
-        task, once: what it knows besides, see `Source` and `per_episode`.
+        task, once, subtracted: what it knows besides, see `Source` and `per_episode`.
         after: columns with what was observed after the action, by those with what was before it.
         place: what a row is called in messages, by its number from 0.
         timestep: of its clock, if its format says it [s].
@@ -62,6 +61,7 @@ class Table:
     layout: Layout = field(default_factory=Layout)
     task: Task | None = None
     once: Mapping[str, Array] = field(default_factory=dict)
+    subtracted: Array | float = 0.0
     after: Mapping[str, str] = field(default_factory=dict)
     place: Callable[[int], str] = lambda row: f"row {row}"
     timestep: float | None = None

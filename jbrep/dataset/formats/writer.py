@@ -150,7 +150,7 @@ def _survey(source: Source, missing: str) -> _Survey:
         told = f"the last step of {counted(counts['cut'], 'episode')} of {source.name} is left out"
         warnings.warn(f"{told}: what was observed after it isn't known", Notice, 2)
     if signals is None:
-        if not source.rows:
+        if source.rows == 0:
             raise InputError(f"{source.name} has no rows")
         raise InputError(
             f"{source.name} has no episode with a step, the last one's observation being the final "
@@ -277,7 +277,7 @@ def _columns(
 
 def _offset(source: Source, task: Task) -> Array | float:
     """What is still to be taken off observations."""
-    return 0.0 if source.is_shifted else task.offset
+    return task.offset - source.subtracted
 
 
 def _bounded(task: Task, action: Array) -> Array:
