@@ -388,7 +388,10 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     for rows in (held_out.data.train, held_out.data.test):
         kept = rows[dataset["step"][rows] < 999]
         now, then = (dataset["observation"][each] for each in (kept, kept + 1))
-        changes.append(then - now)
+        turns = [each.is_full_turn for each in dataset.task.features]
+        change = np.subtract(then, now, dtype=np.float64)
+        change[:, turns] = (change[:, turns] + np.pi) % (2 * np.pi) - np.pi  # the shorter way
+        changes.append(change)
         inputs = np.column_stack((coder.encode(now), dataset["action"][kept]))
         parts.append((inputs, coder.encode(then)))
     (known, after), (unseen, true) = parts

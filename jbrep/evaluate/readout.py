@@ -33,6 +33,7 @@ from jbrep.evaluate.held_out import (
     explained,
     sample_rows,
 )
+from jbrep.evaluate.prediction import changes
 from jbrep.evaluate.regression import Predictor, Problem, ridge
 from jbrep.evaluate.truth import Columns, quantities, quantities_and_features, state
 from jbrep.stats.bootstrap import Array, bootstrap, variation, without_nan
@@ -208,9 +209,9 @@ def dynamics(encoder: BaseEncoder, held_out: HeldOut) -> Dynamics:
 def _steps(encoder: BaseEncoder, held_out: HeldOut, rows: Rows) -> _Steps:
     dataset = held_out.data.dataset
     chosen = held_out.followed(sample_rows(rows, _ROWS, held_out.data.task.size))
-    now, then = (dataset["observation"][r] for r in (chosen, chosen + 1))
-    latent, next_latent = encoder.encode(now), encoder.encode(then)
-    return _Steps(chosen, latent, dataset["action"][chosen], next_latent, then - now)
+    latent, next_latent = (encoder.encode(dataset["observation"][r]) for r in (chosen, chosen + 1))
+    change = changes(held_out.data.task, dataset["observation"], chosen, 1)
+    return _Steps(chosen, latent, dataset["action"][chosen], next_latent, change)
 
 
 def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
