@@ -266,7 +266,8 @@ def test_offsets_are_subtracted_once(to, tmp_path):
     import_data(str(given), tmp_path / "again", task if to == "npz" else None)
     again = Dataset(tmp_path / "again")
     np.testing.assert_array_equal(again["observation"], dataset["observation"])
-    assert (again.task.id == PENDULUM) == (to != "minari")  # which says nothing of offsets
+    assert (again.task.id == PENDULUM) == (to != "minari")
+    assert again.task.offset.tolist() == [5, 0, 0]
 
 
 def test_data_of_different_tasks_are_not_joined(minari_folder, tmp_path):

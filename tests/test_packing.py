@@ -70,6 +70,10 @@ def test_memory_limits_the_width(tmp_path, monkeypatch):
     assert max(map(len, packs)) == 4  # of 19 features, 0.9 GiB
     with pytest.raises(InputError, match="the width is 5: 2 cohorts of 4 agents are the most that"):
         packed(plan, 2, 5)
+    alone = Plan(plan.study.replace(trainer="sb3"), tmp_path)
+    assert {*map(len, packed(alone, 4))} == {1}
+    with pytest.raises(InputError, match="doesn't hold an agent for each of 40 workers"):
+        packed(alone, 40)
 
 
 def test_the_last_worker_decides():

@@ -72,7 +72,7 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
         for cell in {cell.kind: cell for (cell,) in alone}.values()
         if is_off_policy(cell.learner.algorithm)
     ]
-    if min(most, *of_alone) < 1 < workers:
+    if min([most, *of_alone]) < 1 < workers:
         raise InputError(
             f"this machine's memory doesn't hold an agent for each of {workers} workers: give "
             "fewer --workers"

@@ -186,11 +186,15 @@ def _from_data(source: Source, survey: _Survey) -> Task:
             f"{source.name} has {survey.size} features, and names of {len(source.features)}: the "
             "two must be equal"
         )
+    features = source.features or tuple(features_of(source.label, box))
+    subtracted = np.broadcast_to(source.subtracted, survey.size).tolist()
+    offsets = {each.name: by for each, by in zip(features, subtracted, strict=True) if by}
     try:
         return Task(
             id=source.label,
             name=source.label,
-            features=source.features or tuple(features_of(source.label, box)),
+            features=features,
+            offsets=offsets or UNSET,
             action_low=tuple(low.tolist()),
             action_high=tuple(high.tolist()),
             max_episode_steps=max(max(survey.lengths), source.max_episode_steps or 0),
