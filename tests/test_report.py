@@ -623,7 +623,7 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
         ("returns.csv", lambda text: text[:-1] + ",", "returns.csv is damaged or cut short"),
         ("returns.csv", lambda text: text + f"a,b,c,0,{10**30},0,1\n", "returns.csv is damaged or"),
         ("returns.csv", lambda text: text + "a,b,c,0,0,0,nan\n", "returns.csv is damaged or"),
-        ("returns.csv", lambda text: text + "a,b,c,0,0,0,1e16\n", "returns.csv is damaged or"),
+        ("returns.csv", lambda text: text + "a,b,c,0,0,0,1e101\n", "returns.csv is damaged or"),
         ("returns.csv", lambda text: text + '"' + "a" * 200_000, "returns.csv is damaged or"),
         ("references.csv", lambda text: text + "x", "references.csv is damaged or cut short"),
         ("references.csv", lambda text: b"\xff", "references.csv is damaged or cut short"),

@@ -3,7 +3,6 @@
 import csv
 import hashlib
 import io
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -16,6 +15,7 @@ Columns = Mapping[str, Callable[[str], Any]]  # by their names: what their cells
 
 _MAX_BYTES = 1 << 28
 _MOST = 1 << 53  # of a number: a float holds whole ones exactly
+_LARGEST = 1e100  # number whose square is one, too
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -121,9 +121,9 @@ def finite(cell: str) -> float:
     """A number.
 
     Raises:
-        ValueError: it is something else, or infinite.
+        ValueError: it is something else, or so large that squares are infinite.
     """
     number = float(cell)
-    if not math.isfinite(number):
+    if not abs(number) <= _LARGEST:
         raise ValueError
     return number

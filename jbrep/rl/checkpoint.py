@@ -170,7 +170,7 @@ class CheckpointHeader(Document, frozen=True, kw_only=True):
         """As for `Record`."""
         super().check()
         for name in _COUNTERS:
-            count = self.counters.get(name)
+            count = self.counters.get(name, 0)
             if type(count) is not int or count < 0:
                 raise InputError(f"{name} is {shown(count)}: it must be a whole number from 0")
 

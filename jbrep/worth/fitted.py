@@ -147,7 +147,7 @@ def q_iteration(values: Values, steps: Coded, gamma: float, tries: Actions) -> C
     """
 
     def prepared(codes: Codes) -> Any:
-        parts = np.array_split(codes, -(-codes.size * len(tries) // _NUMBERS))
+        parts = np.array_split(codes, 1 + codes.size * len(tries) // _NUMBERS)
         return np.concatenate(
             [
                 values.prepare(np.repeat(part, len(tries), axis=0), np.tile(tries, (len(part), 1)))
