@@ -309,7 +309,7 @@ def returns_of(told, **learned):
         ({"agent": (25, 20)}, "Nothing can be said of the codes: by small agents, none", "20"),
         (
             {"trees": (90, 70), "fourier": (88, 40)},
-            "Take the full observation: by fitted",
+            "Perhaps take the full observation: by fitted",
             "70 [65, 75]; lacks motor_velocity (0.10); ill-conditioned: trees make 70 of it",
         ),
     ],
@@ -325,7 +325,8 @@ def test_of_a_constant_reward_nothing_can_be_learned(told):
     evaluation = returns_of(told, trees=(90, 50))
     constant = evaluation.replace(worth=evaluation.worth.replace(rewards=(0.0, 0.0)))
     ending = constant.replace(worth=constant.worth.replace(ends=True))
-    assert evaluation_text(ending).startswith("Take the full observation")
+    assert evaluation_text(ending).startswith("Perhaps take the full observation")
+    assert "didn't follow it: ask for --worth agent" in " ".join(evaluation_text(ending).split())
     text = evaluation_text(constant)
     assert text.startswith("Every reward of the data is 0: what codes are worth can't be learned")
     assert "90" not in text.partition("\n\n")[0]

@@ -97,14 +97,22 @@ def advice(evaluation: Evaluation, worth: Worth) -> str:
             f"looking at all ({number(found.floor, SIGNIFICANT)}).{_instead(worth)}"
         )
     smallest = min(found.best, key=lambda label: evaluation.encoders[label].latent)
+    take, doubt = ("Take", "") if found.way == AGENT else ("Perhaps take", _doubt(worth))
     if found.best == [FULL]:
-        return f"Take the full observation: by {by}, it is worth more than any code."
+        return f"{take} the full observation: by {by}, it is worth more than any code.{doubt}"
     if len(found.best) == 1:
-        return f"Take {smallest}: by {by}, it is worth the most."
+        return f"{take} {smallest}: by {by}, it is worth the most.{doubt}"
     best = enumerated(found.best)
     return (
-        f"Take {smallest}: by {by}, the smallest of those not clearly worse than the best, {best}."
+        f"{take} {smallest}: by {by}, the smallest of those not clearly worse than the best, "
+        f"{best}.{doubt}"
     )
+
+
+def _doubt(worth: Worth) -> str:
+    """What came out where it was tested: see results/worth-face-direction."""
+    surer = "" if worth.estimated else ": ask for --worth agent"
+    return f" Where this was tested, agents' returns didn't follow it{surer}."
 
 
 def _instead(worth: Worth) -> str:

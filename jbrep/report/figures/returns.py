@@ -1,5 +1,6 @@
 """Final returns, their spread, and learning speed: a point for each run, and intervals."""
 
+import math
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import Any
@@ -33,8 +34,9 @@ _ROOM = 0.04  # of an axis, at its ends, for whole markers
 _MOST, _ACROSS = 3, 60  # names that stand side by side, and letters of so many of the longest
 _DASHED = " Dashed: policies that don't learn, on the same starts."
 _INTERVALS = " Bars: 95 % intervals, from four runs on."
-_TILTED = 0.03  # height that a character of a tilted name takes [inches]
-_USUAL_NAME = 16  # characters, that panels have room for
+_TILTED = 12  # names at most; more stand upright
+_LETTER = 0.06  # length of a character of a name [inches]
+_USUAL_HEIGHT = 8  # characters, one upon another, that panels have room for
 _CUT = " A triangle at an edge: the interval goes beyond it."
 
 
@@ -109,7 +111,13 @@ def _dashed(groups: Groups) -> str:
 def _height(groups: Groups) -> float:
     """Of a row of panels with the names of representations below, tilted if they are many."""
     longest = max(map(len, names_with_runs(groups).values()))
-    return 1.7 + _TILTED * max(0, longest - _USUAL_NAME)
+    most = max(len(group.labels) for group in groups)
+    return 1.7 + _LETTER * max(0, math.sin(math.radians(_tilt(most))) * longest - _USUAL_HEIGHT)
+
+
+def _tilt(names: int) -> float:
+    """Of so many names side by side that they don't fit as they are [degrees]."""
+    return 30.0 if names <= _TILTED else 90.0
 
 
 def _panels(groups: Groups, columns: int, height: float) -> tuple[Figure, Any]:
@@ -184,8 +192,9 @@ def _name_columns(axes: Axes, group: GroupAnalysis) -> None:
     names = list(names_with_runs([group]).values())
     axes.set_title(plain(group.name))
     fits = len(names) <= _MOST and len(names) * max(map(len, names)) <= _ACROSS
-    tilt: dict[str, Any] = {} if fits else {"rotation": 30, "ha": "right"}
-    axes.set_xticks(range(len(names)), names, **tilt)
+    angle = _tilt(len(names))
+    tilt: dict[str, Any] = {"rotation": angle, "ha": "right" if angle < 90 else "center"}
+    axes.set_xticks(range(len(names)), names, **({} if fits else tilt))
     axes.set_xlim(-0.6, len(names) - 0.4)
     axes.grid(visible=False, axis="x")
 
