@@ -2,6 +2,8 @@
 
 from contextlib import closing
 from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,12 +27,14 @@ from jbrep.rl.agent import (
     trained_parts,
     training_seed,
 )
+from jbrep.rl.checkpoint import CheckpointFile
 from jbrep.rl.cohort import ALGORITHMS, get_algorithm
 from jbrep.rl.cohort.algorithm import Batch
 from jbrep.rl.cohort.cohort import Cohort
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.cohort.networks import Stack
 from jbrep.rl.cohort.replay import ReplayBuffer
+from jbrep.rl.cohort.trainer import _begin
 from jbrep.rl.job import Job, Session
 from jbrep.rl.overrides import overridden
 from jbrep.rl.presets import PRESETS
@@ -441,3 +445,18 @@ def test_new_runs_learn_beside_those_that_were_stopped_before_their_first_step(d
         together([first], tmp_path, stop=lambda: True)
     together([first, *others], tmp_path)
     assert_same(tmp_path, done)
+
+
+def test_whose_environment_fails_as_all_resume_is_named():
+    def member(name):
+        return SimpleNamespace(
+            job=SimpleNamespace(checkpoint=CheckpointFile(Path(name), None, {}, None))
+        )
+
+    def failing(snapshots):
+        raise EnvironmentFailedError("out of order", lane=1)
+
+    members = [member("first"), member("second")]
+    cohort = SimpleNamespace(members=members, restore=failing, member_of=members.__getitem__)
+    with pytest.raises(InputError, match=r"^second can't be resumed: out of order"):
+        _begin(cohort, [None, None])

@@ -5,7 +5,6 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
 from jbrep.envs.lanes import EnvironmentFailedError
-from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.rl.agent import unchecked_distributions
 from jbrep.rl.checkpoint import Snapshot, StoppedError
@@ -56,12 +55,12 @@ def _begin(cohort: Cohort, snapshots: Sequence[Snapshot]) -> None:
     """Begin anew, or go on from where the members' snapshots were taken, if there are any."""
     if not snapshots:
         return cohort.begin()
-    try:
-        with cohort.members[0].job.checkpoint.resuming():
+    with cohort.members[0].job.checkpoint.resuming():
+        try:
             return cohort.restore(snapshots)
-    except EnvironmentFailedError as error:
-        path = cohort.member_of(error.lane).job.checkpoint.path
-        raise InputError(f"{path} can't be resumed: {error}") from None
+        except EnvironmentFailedError as error:
+            with cohort.member_of(error.lane).job.checkpoint.resuming():
+                raise
 
 
 def _train(begun: list[_Begun], session: Session) -> Iterator[Ended]:
