@@ -11,6 +11,7 @@ from command import jbrep, mistake, refused
 
 from jbrep.dataset import DataSettings
 from jbrep.envs import Lanes, describe
+from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.domain import Domain, Draws, read_ranges
 from jbrep.envs.randomized import with_domain
 from jbrep.envs.varied import put_factors, velocity_after
@@ -102,6 +103,20 @@ def test_the_same_seed_gives_the_same_bytes_whatever_is_beside_it(name, given, m
     assert_same(whole, tape(task, SEEDS[1:2]), [1])
     assert_same(whole, tape(task, broken_at=5))
     assert_same(whole, tape(task))  # in instances that have played other episodes
+
+
+@pytest.mark.parametrize("name", ["face_direction", "Pendulum-v1"])
+def test_what_was_seen_last_stays_where_the_next_episode_begins(name):
+    task = with_domain(TASKS[name], {"delay": 1})
+    robots = AutoresetLanes(task, len(SEEDS), 1)
+    robots.reset(SEEDS)
+    steps = [robots.step(np.tile(task.action_high, (len(SEEDS), 1))) for _ in range(12)]
+    assert steps[-1].ended.all()
+    lanes = Lanes(task, len(SEEDS), 1)
+    lanes.reset(range(len(SEEDS)), SEEDS)
+    alone = [lanes.step(np.tile(task.action_high, (len(SEEDS), 1)))[0] for _ in range(12)]
+    np.testing.assert_array_equal(steps[-1].final, alone[-1])
+    assert (steps[-1].final != steps[-1].observation).any(axis=1).all()
 
 
 def test_a_history_is_of_what_was_seen():

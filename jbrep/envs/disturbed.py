@@ -79,7 +79,7 @@ class Disturbed:
         late = self._late(self._measured, "delay")
         self._shown = np.where(arrived[:, None], late, self._shown)
         self._given = given
-        return self._shown, *others
+        return self._shown.copy(), *others
 
     def _measure(self, given: Array) -> Array:
         """What sensors say, (n, d): a lane without noise has what is given, to the bit."""

@@ -22,6 +22,7 @@ from jbrep.worth.offline import EPISODES, bounds_of
 
 _ALGORITHM = "sac"
 STEPS, RUNS = 100_000, 2  # of a run, of a code
+_MOST_LETTERS = 100  # of what a run calls its representation
 
 
 def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, Score]:
@@ -39,20 +40,7 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
             `Run.settings`.
     """
     jobs = {
-        (label, seed): Job(
-            Run.of(
-                task,
-                _ALGORITHM,
-                encoder=encoder,
-                representation=slug(label)[-100:],
-                seed=seed,
-                steps=STEPS,
-                evaluate_every=STEPS,
-                final_episodes=EPISODES,
-            ),
-            folder / slug(label)[-100:] / f"seed-{seed}",
-            cores(),
-        )
+        (label, seed): _job(task, label, encoder, seed, folder)
         for label, encoder in encoders.items()
         for seed in range(RUNS)
     }
@@ -71,6 +59,22 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
         returns = np.concatenate([_returns(job, ended[job.folder]) for job in own])
         found[label] = score(mean_within(returns, bounds_of(task), LEVEL))
     return found
+
+
+def _job(task: Task, label: str, encoder: Any, seed: int, folder: Path) -> Job:
+    """A run on a code, by its label."""
+    name = slug(label)[-_MOST_LETTERS:]
+    run = Run.of(
+        task,
+        _ALGORITHM,
+        encoder=encoder,
+        representation=name,
+        seed=seed,
+        steps=STEPS,
+        evaluate_every=STEPS,
+        final_episodes=EPISODES,
+    )
+    return Job(run, folder / name / f"seed-{seed}", cores())
 
 
 def _returns(job: Job, record: RunRecord) -> Array:
