@@ -82,6 +82,21 @@ def test_a_file_of_robomimic(tmp_path):
     assert few.episodes["length"].tolist() == [4, 2, 4, 1, 4, *[3] * 8]
 
 
+def test_what_was_done_before_is_observed_and_is_no_action(tmp_path):
+    def with_last_actions(data):
+        for demo in data.values():
+            done = np.asarray(demo["actions"])
+            demo["obs/actions"] = np.concatenate((0 * done[:1], done[:-1]))
+            demo["next_obs/actions"] = done
+
+    path = write_robomimic(tmp_path / "a.hdf5", damage=with_last_actions)
+    _, data = imported(path)
+    assert data.task.feature_names[:7] == tuple(f"actions_{i}" for i in range(7))
+    actions, observed = np.asarray(data["action"]), np.asarray(data["observation"])[:, :7]
+    np.testing.assert_array_equal(observed[1:6], actions[:5])
+    assert not observed[0].any()
+
+
 def spoiled(*names, **values):
     def damage(data):
         demo = data["demo_2"]

@@ -1,5 +1,6 @@
 """Logs of real robots: layouts as loggers write them, incomplete as they are."""
 
+import hashlib
 import json
 import math
 import re
@@ -9,6 +10,7 @@ import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pandas
 import polars
@@ -650,3 +652,141 @@ def test_a_folder_of_lerobot_s_that_lacks_rows_is_refused(tmp_path):
     (folder / "meta/info.json").write_text(json.dumps(told | {"total_frames": 10_000}))
     said = mistake("data", "import", folder, "--out", tmp_path / "no")
     assert re.search(r"has \d+ rows, and meta/info\.json says 10,000: download it whole", said)
+
+
+@pytest.fixture
+def far(tmp_path):
+    """A data set of two features with offsets of their own."""
+    rows = {"t": np.arange(8) / 10, "x": 1e9 + np.arange(8) / 100, "y": 5 + np.arange(8.0)}
+    rows["action"] = np.full(8, 0.5)
+    path = tmp_path / "far.csv"
+    pandas.DataFrame(rows).to_csv(path, index=False, float_format="%.2f")
+    features = tmp_path / "features.toml"
+    features.write_text("[[features]]\noffset = 1000000000\n[[features]]\noffset = 5\n")
+    options = ("--observations", "x,y", "--time", "t", "--features", features)
+    return imported(path, *options, out="far")[1]
+
+
+@pytest.mark.parametrize("form", ["lerobot", "parquet"])
+def test_offsets_go_with_their_columns(form, far, tmp_path):
+    out = tmp_path / f"out.{form}"
+    assert jbrep("data", "export", far.folder, "--to", form, "--out", out).exit_code == 0
+    names = "observation.state.y,observation.state.x" if form == "lerobot" else "y,x"
+    told, turned = imported(out, "--observations", names, out="turned")
+    assert turned.task.feature_names == ("y", "x")
+    assert turned.task.offsets == {"x": 1e9, "y": 5}
+    assert turned.task.id != far.task.id or form == "lerobot"
+    steps = len(turned["x"])
+    np.testing.assert_array_equal(turned["x"], far["x"][:steps])
+    _, one = imported(out, "--observations", names.split(",")[0], out="one")
+    assert one.task.offsets == {"y": 5}
+    assert "is near" not in told  # what lacks its offset already loses nothing
+
+
+def test_offsets_of_another_size_are_refused(far, tmp_path):
+    for form, change in (("npz", {"feature_offsets": np.zeros(3)}), ("lerobot", [1.0])):
+        out = tmp_path / f"out.{form}"
+        assert jbrep("data", "export", far.folder, "--to", form, "--out", out).exit_code == 0
+        if form == "npz":
+            with np.load(out) as arrays:
+                np.savez(out, **{**arrays, **change})
+        else:
+            info = json.loads((out / "meta/info.json").read_text())
+            (out / "meta/info.json").write_text(json.dumps(info | {"feature_offsets": change}))
+        said = mistake("data", "import", out, "--out", tmp_path / "no")
+        assert "must be 2 numbers" in said
+
+
+def test_a_reward_of_ones_own_takes_nothing_of_the_files(tmp_path, rewards):
+    rows = {"t": np.arange(10) / 10, "pitch": np.arange(10.0), "u": np.full(10, 0.5)}
+    rows |= {"reward": ["1"] * 4 + [""] + ["1"] * 5, "step": np.arange(10)}
+    path = write_csv(tmp_path / "a.csv", {name: [*map(str, each)] for name, each in rows.items()})
+    options = ("--actions", "u", "--time", "t", "--reward", "my_rewards:upright")
+    told, data = imported(path, *options)
+    assert data.task.feature_names == ("pitch",)  # neither what is rewarded nor a row's number
+    assert data.episodes["length"].tolist() == [9]
+    assert "not used: reward, step" in told
+    _, skipped = imported(path, *options, "--missing", "skip", out="skipped")
+    assert skipped.episodes["length"].tolist() == [9]
+
+
+def test_how_an_episode_ends_is_kept_where_its_last_time_is_there_twice(tmp_path):
+    x = np.arange(6.0)
+    rows = {"t": [0, 1, 2, 3, 4, 4], "observation": x, "action": np.full(6, 0.5)}
+    rows |= {"next_observation": x + 1, "terminated": x == 5}
+    data = Dataset.from_table(tmp_path / "a", rows, Layout(time="t"))
+    assert data.episodes["terminated"].tolist() == [True]
+    assert data.episodes["final_observation"].tolist() == [[6]]
+
+
+def test_whole_numbers_in_lists_are_refused_too(tmp_path):
+    wide = pa.FixedSizeListArray.from_arrays(pa.array((1 << 53) + np.arange(16) // 2), 2)
+    rows = {"x": wide, "u": np.zeros(8), "step": np.arange(8)}
+    with pytest.raises(InputError, match=r"row 1: 'x.0' is 9007199254740993: whole numbers"):
+        Dataset.from_table(tmp_path / "a", rows, Layout(observations=("x",), actions=("u",)))
+
+
+def test_a_row_without_any_number_is_no_line_of_units(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t,x,u\nNA,NA,NA\n1,2,3\n2,3,3\n")
+    assert "line 2: 't' is empty" in mistake(
+        *("data", "import", path, "--time", "t", "--actions", "u", "--missing", "skip"),
+        *("--out", tmp_path / "no"),
+    )
+
+
+def test_an_episode_without_a_name_is_refused(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("trip,x,u\na,1,2\na,2,3\n,3,3\nb,4,4\nb,5,4\n")
+    names = ("--episode", "trip", "--actions", "u", "--missing", "skip")
+    said = mistake("data", "import", path, *names, "--out", tmp_path / "no")
+    assert "line 4: 'trip' has an empty cell: fill it" in said
+
+
+def test_what_a_table_says_of_itself_may_be_anything(tmp_path):
+    metadata = {"unit": "°".encode("latin-1"), "names": b"\xff", "offsets": b"many"}
+    fields = [pa.field("x", pa.float64(), metadata=metadata), pa.field("action", pa.float64())]
+    columns = [[0.0, 1, 2], [0.5] * 3]
+    pq.write_table(pa.table(columns, pa.schema(fields)), tmp_path / "a.parquet")
+    _, data = imported(tmp_path / "a.parquet", "--length", "9")
+    assert [(each.name, each.unit) for each in data.task.features] == [("x", "\ufffd")]
+    told = pa.schema(fields[1:]).with_metadata({"jbrep": "[]"})
+    table = pa.table(columns[1:], told)
+    checksums = {"settings": hashlib.sha256(b"[]").hexdigest(), "columns": {}, "episodes": "0" * 64}
+    head = {"format": "jbrep table", "format_version": 1}
+    table = table.replace_schema_metadata(
+        {"jbrep": "[]", "jbrep checksums": json.dumps(head | checksums)}
+    )
+    pq.write_table(table, tmp_path / "b.parquet")
+    said = mistake("data", "import", tmp_path / "b.parquet", "--out", tmp_path / "no")
+    assert "b.parquet" in said
+
+
+@pytest.mark.parametrize("value", [{"fps": 10**400}, {"total_frames": math.inf}])
+def test_numbers_beyond_all_bounds_in_lerobot_s_own(value, tmp_path):
+    folder = lerobot_folder(tmp_path / "le")
+    told = json.loads((folder / "meta/info.json").read_text())
+    (folder / "meta/info.json").write_text(json.dumps(told | value))
+    assert "isn't as LeRobot writes it" in mistake(
+        "data", "import", folder, "--out", tmp_path / "no"
+    )
+
+
+def test_no_link_in_a_lerobot_data_set_is_followed(tmp_path):
+    folder = lerobot_folder(tmp_path / "le")
+    shutil.move(folder / "data/chunk-000", tmp_path / "elsewhere")
+    (folder / "data/chunk-000").symlink_to(tmp_path / "elsewhere")
+    said = mistake("data", "import", folder, "--out", tmp_path / "no")
+    assert "chunk-000 is a link, which isn't followed there" in said
+
+
+def test_a_column_too_wide_to_be_used_is_left_out(tmp_path):
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file["observations"], file["actions"] = np.zeros((3, 2)), np.zeros((3, 1))
+        file["terminals"] = np.array([0, 0, 1])
+        file.create_dataset("lidar", data=np.ones((3, 5000), "i1"), compression="gzip")
+    told, _ = imported(tmp_path / "a.hdf5")
+    assert "images are left out: lidar" in told
+    rows = {"x": [0.0, 1], "action": [0.5, 0.5], "lidar": [np.zeros(5000)] * 2}
+    with pytest.raises(InputError, match="in the column 'lidar': it must be plain numbers"):
+        Dataset.from_table(tmp_path / "b", rows, Layout(length=9))

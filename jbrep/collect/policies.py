@@ -45,7 +45,7 @@ def generators(task: Task, seeds: Sequence[int]) -> list[np.random.Generator]:
     """A policy's random generator for each episode.
 
     It is NumPy's default one with the episode's seed, beyond the numbers that the environment
-    draws from its own: after them where they are known, else 2**127 numbers further.
+    draws from its own: after them where they are known, else after `PCG64.jumped`.
     """
     streams = [np.random.PCG64(seed) for seed in seeds]
     if task.draws is None:

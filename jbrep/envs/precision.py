@@ -32,6 +32,10 @@ class Signals(NamedTuple):
             count += max(len(finite) - 1, 0)
         return cls(low, high, np.sqrt(squares / max(count, 1)))
 
+    def plus(self, offset: Array) -> "Signals":
+        """Of the features before an offset, (d,), was subtracted."""
+        return Signals(self.low + offset, self.high + offset, self.change)
+
     def with_more(self, other: "Signals") -> "Signals":
         """Of these and others, by the larger changes."""
         return Signals(

@@ -273,7 +273,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
 
         A lane without a seed draws from its generator as it is.
         """
-        if seed is None or isinstance(seed, int):
+        if seed is None or isinstance(seed, int | np.integer):
             seed = [None if seed is None else seed + lane for lane in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise InputError(f"{len(seed)} seeds for {self.num_envs} lanes: give one for each lane")

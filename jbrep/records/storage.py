@@ -95,8 +95,7 @@ def inside(folder: Path, *parts: str) -> Path:
         path = path / name
         if path.is_symlink():
             raise InputError(
-                f"{path} is a link, which isn't followed inside a folder of jbrep's: put the "
-                "folder itself there"
+                f"{path} is a link, which isn't followed there: put what it leads to in its place"
             )
     return path
 

@@ -26,5 +26,5 @@ def table_of(frame: Any, name: str) -> Table:
     def batches(names: list[str]) -> Iterator[pa.RecordBatch]:
         yield from table.select(names).to_batches(CHUNK)
 
-    schema = with_widths(table.schema, next(iter(table.to_batches(1)), None))
+    schema = with_widths(table.schema, next(iter(table.slice(0, 1).to_batches()), None))
     return Table(name, label(name), schema, batches, rows=table.num_rows)

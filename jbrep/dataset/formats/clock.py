@@ -79,12 +79,16 @@ class Clock:
                 yield some | ({"step": some["step"] - begin} if "step" in some else {})
 
     def _once_each(self, rows: Rows) -> Rows:
-        """The rows without those that have the time of the one before."""
+        """The rows without those that have the time of the one before; how it ends is kept."""
         if "time" not in rows:
             return rows
         again = np.diff(rows["time"], prepend=-np.inf) == 0
         self._counts["repeated"] += int(again.sum())
-        return {name: values[~again] for name, values in rows.items()}
+        once = {name: values[~again] for name, values in rows.items()}
+        for name in (name for name in (*ENDS, "next_observation") if name in rows):
+            once[name] = once[name].copy()
+            once[name][-1] = rows[name][-1]
+        return once
 
     def _resampled(self, rows: Rows) -> Iterator[Rows]:
         """The rows on an even clock, from where each column has had a reading."""

@@ -17,7 +17,8 @@ from jbrep.errors import InputError, first_line
 
 _SEPARATORS = ",;\t|"
 _COMMENTS = ("#", "%")
-_EMPTY = [*pa_csv.ConvertOptions().null_values, "-", "--", "None", "NAN", "Nan"]
+_MISSING = [*pa_csv.ConvertOptions().null_values, "None", "NAN", "Nan"]
+_EMPTY = [*_MISSING, "-", "--"]  # which stand for no unit, too
 _UNIT = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\])]*)[\])]")
 _TELLING = {*RADIANS, *DEGREES, *SECONDS}  # units that change what numbers mean
 _PLACE = re.compile(r"\w[\[(]\d+[\])]$")  # of q[0], which is no unit
@@ -140,11 +141,12 @@ def _is_number(cell: str) -> bool:
 
 
 def _is_value(cell: str) -> bool:
-    """Whether it may be a row's: a number, a date or a flag."""
+    """Whether it may be a row's: a number, one that is missing, a date or a flag."""
     return bool(
         _is_number(cell.replace(",", "."))
         or _DATE.fullmatch(cell)
         or cell.lower() in ("true", "false")
+        or (cell and cell in _MISSING)
     )
 
 

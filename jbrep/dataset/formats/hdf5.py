@@ -8,7 +8,7 @@ and `timeouts`. Robomimic's have a group for each episode, `data/demo_0` and so 
 import json
 import math
 from bisect import bisect
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -25,6 +25,7 @@ from jbrep.dataset.formats.episodes import check_kind, check_lengths, label
 from jbrep.dataset.formats.flat import CHUNK, own_names
 from jbrep.dataset.formats.tables import NAMES, Table, width
 from jbrep.dataset.layout import Layout
+from jbrep.envs.task import MAX_FEATURES
 from jbrep.errors import InputError, kind_and_line, listed
 from jbrep.text import counted
 
@@ -155,11 +156,12 @@ def _of_robomimic(path: Path, file: h5py.File, demos: list[str]) -> Table:
             ends = np.ravel(done) > 0
         early += int(ends[:-1].sum())
         ends[:-1] = False
-        paths = {_column(n): f"{name}/{n}" for n, each in arrays.items() if len(each) == rows}
+        paths = {_column(n, arrays): f"{name}/{n}" for n, e in arrays.items() if len(e) == rows}
         made = {"episode": np.full(rows, number), "terminated": ends}
         parts.append(_Part(f"{name}, step", rows, paths, made))
     first = {name: file[each] for name, each in parts[0].arrays.items() if name != "dones"}
-    seen = [_column(n) for n in _arrays(file[demos[0]]) if n.startswith(_NOW)]
+    arrays = _arrays(file[demos[0]])
+    seen = [_column(n, arrays) for n in arrays if n.startswith(_NOW)]
     seen = [name for name in seen if name in first and not _is_image(first[name])]
     note = f"{counted(early, 'step')} done before the end of a demo: the episode goes on there"
     table = _table(path, parts, first, [note] if early else [])
@@ -169,13 +171,17 @@ def _of_robomimic(path: Path, file: h5py.File, demos: list[str]) -> Table:
         label=label(name) if name else table.label,
         timestep=timestep,
         layout=Layout(observations=tuple(seen) or (_NOW,), actions=("actions",)),
-        after={name: f"{_NEXT}{name}" for name in seen},
+        after={name: f"{_NEXT}{name.removeprefix(_NOW)}" for name in seen},
     )
 
 
-def _column(name: str) -> str:
-    """What an array of a demo is called: as robomimic calls what is observed."""
-    return name.removeprefix(_NOW)
+def _column(name: str, others: Collection[str]) -> str:
+    """What an array of a demo is called: as robomimic calls what is observed, if nothing else is.
+
+    What was done before, `obs/actions`, isn't what is done then, `actions`.
+    """
+    short = name.removeprefix(_NOW)
+    return name if short in others else short
 
 
 def _environment(told: Any) -> tuple[str, float | None]:
@@ -189,6 +195,9 @@ def _environment(told: Any) -> tuple[str, float | None]:
 
 
 def _is_image(array: h5py.Dataset) -> bool:
+    """Whether it is one, or has as many numbers in a row."""
+    if math.prod(array.shape[1:]) > MAX_FEATURES:
+        return True
     return array.ndim >= _IMAGE_AXES or (array.ndim == _IMAGE_AXES - 1 and array.dtype == np.uint8)
 
 

@@ -15,13 +15,19 @@ import pyarrow.parquet as pq
 
 from jbrep.dataset.formats.episodes import label
 from jbrep.dataset.formats.parquet import batches_of, check_sizes, reading
-from jbrep.dataset.formats.tables import NAMES, Table, width, with_widths
+from jbrep.dataset.formats.tables import NAMES, Table, width, with_offsets, with_widths
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
 from jbrep.errors import InputError, kind_and_line
 from jbrep.progress import Progress
-from jbrep.records.storage import publish_folder, read_regular, unfinished, write_whole
+from jbrep.records.storage import (
+    inside,
+    publish_folder,
+    read_regular,
+    unfinished,
+    write_whole,
+)
 
 EPISODE_BYTES = 1 << 10  # in the table of episodes
 INFO = "meta/info.json"
@@ -31,6 +37,7 @@ _FILE_ROWS = 1 << 20  # of what is written
 _CHUNK_FILES = 1000
 _IMAGES = ("image", "video")
 _OFFSETS = "feature_offsets"  # of jbrep's own
+_STATE = "observation.state"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _NUMBERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
@@ -42,13 +49,13 @@ def open_table(given: str) -> Table:
         InputError: it can't be read, or has another layout; or a link in place of a file.
     """
     folder = Path(given)
-    info = _info(folder / INFO)
+    info = _info(inside(folder, INFO))
     paths = sorted(folder.glob("data/*/*.parquet"))
     if not paths:
         raise InputError(f"{given} has no data/chunk-*/*.parquet: download it whole")
     for path in paths:
-        if path.is_symlink() or not path.is_file():
-            raise InputError(f"{path} must be a plain file: no link, pipe or device is opened")
+        if not inside(folder, *path.relative_to(folder).parts).is_file():
+            raise InputError(f"{path} must be a plain file: no pipe or device is opened")
     rows, schema = 0, None
     for path in paths:
         with reading(path), pq.ParquetFile(path) as file:
@@ -63,17 +70,22 @@ def open_table(given: str) -> Table:
             f"{given} has {rows:,} rows, and {INFO} says {info['frames']:,}: download it whole"
         )
     known = info["features"]
+    schema = _named(schema, known)
+    if (offsets := info["offsets"]).ndim and _STATE in schema.names:
+        size = width(schema.field(_STATE).type) or 1
+        if offsets.shape != (size,) or not np.isfinite(offsets).all():
+            raise InputError(f"{given}: {_OFFSETS} in {INFO} must be {size} numbers")
+        schema = with_offsets(schema, _STATE, offsets.tolist())
     images = [name for name, each in known.items() if each["dtype"] in _IMAGES]
     seen = [n for n in known if n.startswith("observation.") and n not in images]
     return Table(
         given,
         label(folder.resolve().name),
-        _named(schema, known),
+        schema,
         lambda columns: _batches(paths, columns),
         rows=rows,
         layout=Layout(observations=tuple(seen), actions=("action",)),
         timestep=1 / info["fps"],
-        subtracted=info["offsets"],
         notes=(f"images are left out: {', '.join(images)}",) if images else (),
     )
 
@@ -88,7 +100,10 @@ def _info(path: Path) -> dict[str, Any]:
         known = {str(name): dict(each) for name, each in info["features"].items()}
         known = {name: each | {"dtype": str(each["dtype"])} for name, each in known.items()}
         offsets = np.array(info.get(_OFFSETS, 0.0), np.float64)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (
+        *(ValueError, KeyError, TypeError),
+        *(AttributeError, OverflowError, RecursionError),
+    ) as error:
         raise InputError(f"{path} isn't as LeRobot writes it: {kind_and_line(error)}") from None
     if not version.startswith(_VERSIONS):
         raise InputError(f"{path} is of LeRobot's layout {version}: it must be v3.0 or v2.1")
@@ -105,7 +120,8 @@ def _named(schema: pa.Schema, known: Mapping[str, Any]) -> pa.Schema:
             names = next(iter(names.values()), None)
         fits = isinstance(names, list) and len(names) == (width(each.type) or 1)
         if fits and all(isinstance(name, str) for name in names):
-            schema = schema.set(i, each.with_metadata({NAMES: "\n".join(names).encode()}))
+            lines = "\n".join(names).encode(errors="replace")
+            schema = schema.set(i, each.with_metadata({NAMES: lines}))
     return schema
 
 
@@ -136,7 +152,7 @@ def write(dataset: Dataset, out: Path) -> str:
 def _features(dataset: Dataset) -> dict[str, Any]:
     task = dataset.task
     actions = [f"action_{i}" for i in range(task.action_size)]
-    wide = {"observation.state": list(task.feature_names), "action": actions}
+    wide = {_STATE: list(task.feature_names), "action": actions}
     features = {n: {"dtype": "float32", "shape": [len(v)], "names": v} for n, v in wide.items()}
     single = {"next.reward": "float32"} if "reward" in dataset.columns else {}
     single |= {name: "float32" if name == "timestamp" else "int64" for name in _NUMBERS}
@@ -169,7 +185,7 @@ def _write_steps(dataset: Dataset, folder: Path, fps: float) -> list[int]:
         columns = {"timestamp": steps / fps, "frame_index": steps, "index": begin + steps}
         columns |= {"episode_index": np.full(length, number), "task_index": np.zeros(length)}
         columns |= {"next.reward": episode["reward"]} if "next.reward" in schema.names else {}
-        wide = {"observation.state": episode["observation"], "action": episode["action"]}
+        wide = {_STATE: episode["observation"], "action": episode["action"]}
         columns |= {name: values[:, 0] for name, values in wide.items()}  # where it is one number
         arrays = [
             pa.FixedSizeListArray.from_arrays(wide[each.name].ravel(), each.type.list_size)
@@ -215,7 +231,7 @@ def _write_meta(dataset: Dataset, folder: Path, files: list[int], fps: float) ->
     tasks = tasks.replace_schema_metadata({"pandas": json.dumps({**pandas, "pandas_version": "2"})})
     pq.write_table(tasks, folder / "meta/tasks.parquet")
     stats = {}
-    for column, of in (("observation.state", "observation"), ("action", "action")):
+    for column, of in ((_STATE, "observation"), ("action", "action")):
         (low, high), (mean, std) = extrema(dataset[of].chunks()), mean_and_std(dataset[of].chunks())
         told = {"min": low, "max": high, "mean": mean, "std": std, "count": [len(dataset)]}
         stats[column] = {what: np.asarray(each).tolist() for what, each in told.items()}

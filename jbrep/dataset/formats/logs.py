@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from jbrep.dataset.formats.tables import (
     Roles,
     Table,
     features_of_table,
+    is_of_task,
     roles_of,
     sort_of,
     width,
@@ -60,21 +62,35 @@ def source_of_table(table: Table, given: Layout | None = None, missing: str = ""
     """
     layout = _both(table, given or Layout())
     roles = roles_of(table, layout)
-    features = tuple(features_of_table(table, roles["observation"]))
+    seen, is_own = roles["observation"], is_of_task(table, roles)
+    table = replace(table, once=_once_of(table, seen))
     reader = _Reader(table, layout, roles, missing)
     return Source(
         table.name,
         table.label,
         reader.episodes,
-        task=table.task,
-        features=() if table.task else features,
+        task=table.task if is_own else None,
+        features=() if is_own else tuple(features_of_table(table, seen)),
+        why_no_task="its columns aren't those of its task" if table.task else Source.why_no_task,
         rows=None if layout.rate else table.rows,
         has_rewards="reward" in roles,
-        subtracted=table.subtracted if table.task is None else table.task.offset,
+        subtracted=np.array([each.subtracted for each in seen]),
         timestep=1 / layout.rate if layout.rate else table.timestep or reader.timestep,
         notes=reader.notes(),
         changes=reader.changes,
     )
+
+
+def _once_of(table: Table, seen: list[Leaf]) -> dict[str, Array]:
+    """What is known once for each episode, of the columns that are observed."""
+    names = table.task.feature_names if table.task else ()
+    once = {**table.once}
+    if not {each.name for each in seen} <= {*names}:
+        once.pop("final_observation", None)
+    elif "final_observation" in once:
+        chosen = [names.index(each.name) for each in seen]
+        once["final_observation"] = once["final_observation"][:, chosen]
+    return once
 
 
 def _both(table: Table, given: Layout) -> Layout:
@@ -201,7 +217,8 @@ class _Reader:
         kind, empty, size = column.type, column.null_count, width(known)
         if sort_of(kind) != sort_of(known):
             raise InputError(f"{self._at(first)}: {name!r} has {kind}, not {known} as before")
-        if empty and (size or not (pa.types.is_floating(kind) or self._may_miss)):
+        may_miss = self._may_miss and sort_of(known) != "word"
+        if empty and (size or not (pa.types.is_floating(kind) or may_miss)):
             row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
             raise InputError(f"{self._at(first + row)}: {name!r} has an empty cell: fill it")
         if size is not None:
@@ -212,8 +229,10 @@ class _Reader:
                     f"{self._at(first + row)}: {name!r} has {lengths[row]} numbers, not {size} as "
                     "before"
                 )
-            flat = column.flatten().to_numpy(zero_copy_only=False)
-            return flat.astype(float).reshape(len(column), size)
+            flat = column.flatten()
+            flat = flat.cast(pa.float64()) if pa.types.is_decimal(flat.type) else flat
+            numbers: Array = flat.to_numpy(zero_copy_only=False)
+            return numbers.reshape(len(column), size)
         if pa.types.is_temporal(kind):
             wide = pa.timestamp("ns") if pa.types.is_timestamp(kind) else pa.duration("ns")
             try:

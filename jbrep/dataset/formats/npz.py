@@ -3,7 +3,7 @@
 import math
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
@@ -103,7 +103,7 @@ def open_source(given: str) -> Source:
         check_arrays(given, {column: stored[name] for column, name in own.items()})
         known = per_episode(given, _once(archive, stored))
         features = _features(archive, stored)
-        offsets = _whole(archive, _OFFSETS) if _OFFSETS in stored else 0.0
+        offsets = _offsets(archive, stored, own["observation"])
     return Source(
         given,
         label(path.stem),
@@ -168,6 +168,17 @@ def _once(archive: zipfile.ZipFile, names: Collection[str]) -> dict[str, Array]:
         for alias in aliases
         if alias in names
     }
+
+
+def _offsets(archive: zipfile.ZipFile, stored: Mapping[str, _Stored], observation: str) -> Array:
+    """What observations lack already; (d,) zeros if nothing is said."""
+    size = math.prod(stored[observation].shape[1:])
+    if _OFFSETS not in stored:
+        return np.zeros(size)
+    offsets = _whole(archive, _OFFSETS)
+    if offsets.shape != (size,) or offsets.dtype.kind != "f" or not np.isfinite(offsets).all():
+        raise InputError(f"{archive.filename}: {_OFFSETS} must be {size} numbers, of each feature")
+    return offsets.astype(np.float64)
 
 
 def _features(archive: zipfile.ZipFile, names: Collection[str]) -> tuple[Feature, ...]:

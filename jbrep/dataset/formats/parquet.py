@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.formats.episodes import ENDS, label
 from jbrep.dataset.formats.flat import CHUNK, per_episode
-from jbrep.dataset.formats.tables import Table, with_widths
+from jbrep.dataset.formats.tables import Table, with_offsets, with_widths
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.settings import Digest
 from jbrep.envs.task import MAX_FEATURES, Task
@@ -68,15 +68,18 @@ def open_table(given: str) -> Table:
         metadata, schema = file.metadata, file.schema_arrow
         check_sizes(given, metadata, schema)
         schema = with_widths(schema, next(file.iter_batches(1), None))
-    known = _checksums(path, metadata.metadata or {})
+        known = _checksums(path, metadata.metadata or {})
+        task = _own_task(schema, metadata.metadata) if known else None
+    for name, offset in zip(task.feature_names, task.offset, strict=True) if task else ():
+        schema = with_offsets(schema, name, [float(offset)])
     return Table(
         given,
         label(path.stem),
         schema,
         lambda columns: _batches(path, columns, known),
         rows=metadata.num_rows,
-        task=_own_task(schema, metadata.metadata) if known else None,
-        once=_once(path, known) if known else {},
+        task=task,
+        once=_once(path, known, metadata.num_rows) if known else {},
     )
 
 
@@ -87,7 +90,7 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
         reason = first_line(error)
         raise InputError(f"{path} can't be read as a Parquet file: {reason}") from None
 
@@ -158,8 +161,8 @@ def _beside(path: Path) -> Path:
     return path.with_stem(f"{path.stem}-episodes")
 
 
-def _once(path: Path, known: Checksums) -> dict[str, NDArray[Any]]:
-    """What the file of episodes says that jbrep exports beside a table."""
+def _once(path: Path, known: Checksums, rows: int) -> dict[str, NDArray[Any]]:
+    """What the file of episodes says that jbrep exports beside a table of so many rows."""
     beside = _beside(path)
     if not exists(beside):
         raise InputError(f"{beside} is missing: it belongs to {path}, and must stand beside it")
@@ -168,8 +171,11 @@ def _once(path: Path, known: Checksums) -> dict[str, NDArray[Any]]:
         raise DamageError(
             f"{beside} is damaged, or of another data set than {path}: export the data set again"
         )
-    with reading(beside):
-        table = pq.read_table(io.BytesIO(content))
+    with reading(beside), pq.ParquetFile(io.BytesIO(content)) as file:
+        check_sizes(str(beside), file.metadata, file.schema_arrow)
+        if file.metadata.num_rows > rows:
+            raise InputError(f"{beside} has more episodes than {path} has rows")
+        table = file.read()
         final = np.stack(table["final_observation"].to_numpy())
         once = {name: table[name].to_numpy() for name in (*ENDS, "seed")}
         return per_episode(str(beside), {"final_observation": final, **once})

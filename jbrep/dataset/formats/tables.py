@@ -3,25 +3,27 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from jbrep.dataset.formats.episodes import ALIASES, WHOLE, WIDE, check_kind, check_names
 from jbrep.dataset.formats.flat import own_names
 from jbrep.dataset.layout import Layout
 from jbrep.envs.names import is_code
-from jbrep.envs.task import Feature, Task
+from jbrep.envs.task import MAX_FEATURES, Feature, Task
 from jbrep.errors import InputError, matching
 from jbrep.text import words
 
 Array = NDArray[Any]
 
-UNIT, NAMES = b"unit", b"names"  # in a field's metadata: its unit, and those of a list's numbers
+UNIT = b"unit"  # in a field's metadata
+NAMES, OFFSETS = b"names", b"offsets"  # of its numbers, in lines: names, and what they lack already
 _ACTION = re.compile(r"actions?(_\d+)?")
 _NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
 DEGREES = ("deg", "°", "degrees", "degree")
@@ -45,7 +47,7 @@ class Table:
         batches: of some columns by name, from the first row on at each call.
         rows: how many there are, if that is known.
         layout: what its format says of its columns.
-        task, once, subtracted: what it knows besides, see `Source` and `per_episode`.
+        task, once: what it knows besides, see `Source` and `per_episode`.
         after: columns with what was observed after the action, by those with what was before it.
         place: what a row is called in messages, by its number from 0.
         timestep: of its clock, if its format says it [s].
@@ -61,7 +63,6 @@ class Table:
     layout: Layout = field(default_factory=Layout)
     task: Task | None = None
     once: Mapping[str, Array] = field(default_factory=dict)
-    subtracted: Array | float = 0.0
     after: Mapping[str, str] = field(default_factory=dict)
     place: Callable[[int], str] = lambda row: f"row {row}"
     timestep: float | None = None
@@ -78,6 +79,7 @@ class Leaf(NamedTuple):
     place: int | None = None  # in a list
     unit: str = ""
     is_angle: bool = False
+    subtracted: float = 0.0  # already
 
 
 Roles = Mapping[str, list[Leaf]]  # by the names of ALIASES, and time
@@ -94,26 +96,39 @@ def _leaves(table: Table, units: Mapping[str, str]) -> list[Leaf]:
 
 def _own_leaves(schema: pa.Schema) -> Iterator[Leaf]:
     for each in schema:
-        said = each.metadata or {}
-        unit = said.get(UNIT, b"").decode()
-        names = said.get(NAMES, b"").decode().split("\n") if NAMES in said else []
+        said = {key: text.decode(errors="replace") for key, text in (each.metadata or {}).items()}
         size = width(each.type)
-        for i in range(1 if size is None else size):
+        if size is not None and size > MAX_FEATURES:
+            size = None  # it can't be used, and is refused if it is named
+        count = 1 if size is None else size
+        names = said[NAMES].split("\n") if NAMES in said else []
+        offsets = map(float, said[OFFSETS].split("\n")) if OFFSETS in said else [0.0] * count
+        for i, offset in zip(range(count), offsets, strict=True):
             name, short, place = each.name, names[0] if names else each.name, None
             if size is not None:
                 place, short = i, names[i] if names else f"{each.name}_{i}"
                 name = f"{each.name}.{names[i] if names else i}"
-            yield Leaf(name, short, each.name, place, unit)
+            leaf = Leaf(name, short, each.name, place, said.get(UNIT, ""))
+            yield leaf._replace(subtracted=offset)
 
 
 def with_widths(schema: pa.Schema, first: pa.RecordBatch | None) -> pa.Schema:
-    """The schema with lists as long as they are in the first row."""
+    """The schema of a file: lists as long as they are in the first row, and units alone."""
     for i, each in enumerate(schema):
+        units = {name: text for name, text in (each.metadata or {}).items() if name == UNIT}
+        schema = schema.set(i, each := each.with_metadata(units))
         if pa.types.is_list(each.type) or pa.types.is_large_list(each.type):
-            told = first.column(each.name)[:1].to_pylist() if first else []
-            size = len(told[0]) if told and told[0] is not None else 0
-            schema = schema.set(i, each.with_type(pa.list_(each.type.value_type, size)))
+            size = pc.list_value_length(first.column(i))[0].as_py() if first else 0
+            schema = schema.set(i, each.with_type(pa.list_(each.type.value_type, size or 0)))
     return schema
+
+
+def with_offsets(schema: pa.Schema, name: str, offsets: Sequence[float]) -> pa.Schema:
+    """The schema with what a column's numbers lack already."""
+    i = schema.get_field_index(name)
+    lines = "\n".join(map(repr, offsets)).encode()
+    known = schema.field(i).metadata or {}
+    return schema.set(i, schema.field(i).with_metadata({**known, OFFSETS: lines}))
 
 
 def width(kind: pa.DataType) -> int | None:
@@ -163,6 +178,8 @@ def _said(table: Table, layout: Layout) -> dict[str, tuple[str, ...]]:
     once["reward"] = layout.reward if not is_code(layout.reward) else ""
     if layout.time:  # which tells more than the numbers of steps
         said.pop("step", None)
+    if is_code(layout.reward):
+        said.pop("reward", None)
     said |= {role: (given,) for role, given in once.items() if given}
     wide = {"action": layout.actions, "observation": layout.observations}
     return said | {role: given for role, given in wide.items() if given}
@@ -182,9 +199,18 @@ def _others(table: Table, leaves: list[Leaf], roles: Roles) -> Iterator[Leaf]:
         yield from _matching(table, leaves, table.task.feature_names)
         return
     taken = {each.name for some in roles.values() for each in some}
+    own = {*own_names(table.name, table.schema.names).values()}  # also where another is named
     for each in leaves:
-        if each.name not in taken and not _NOT_FEATURES.fullmatch(each.column):
+        if not (each.name in taken or each.column in own or _NOT_FEATURES.fullmatch(each.column)):
             yield each
+
+
+def is_of_task(table: Table, roles: Roles) -> bool:
+    """Whether observations and actions are those of the table's task, in its order."""
+    names = tuple(each.name for each in roles["observation"])
+    actions = [table.schema.get_field_index(each.column) for each in roles["action"]]
+    known = table.task.feature_names if table.task else ()
+    return names == known and actions == sorted(actions)
 
 
 def _matching(

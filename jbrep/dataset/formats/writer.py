@@ -80,7 +80,8 @@ def write(
             survey = _survey(source, missing)
             fitting = _fitting(source, survey, task or source.task)
             fitting = with_features(fitting, features) if features else fitting
-            for problem in precision_problems(fitting, survey.signals):
+            given = survey.signals.plus(np.asarray(source.subtracted))
+            for problem in precision_problems(fitting, given):
                 warnings.warn(problem, Notice, stacklevel=2)
             fitting = fitting.replace(missing=missing) if missing else fitting
             fitting = without_range(fitting) if reward else fitting
