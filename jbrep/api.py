@@ -443,9 +443,10 @@ def _study(given: "Study | Mapping[str, Any] | str | Path") -> "Study":
 def _tell_kept(folder: Path, policy: Mapping[str, Any]) -> None:
     """Say which policies of runs the data set has already, as they were then."""
     from jbrep.dataset.settings import TRAINED, parts_of
+    from jbrep.records.storage import exists
 
     for part in parts_of(policy):
-        if part["kind"] == TRAINED and (folder / part["file"]).exists():
+        if part["kind"] == TRAINED and exists(folder / part["file"]):
             known = f"{part['run']} acts as it did at step {part['step']:,}"
             _note(f"{known}, which {folder / part['file']} keeps")
 

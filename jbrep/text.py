@@ -78,6 +78,11 @@ def html(*parts: "str | Table") -> str:
     )
 
 
+def possessive(name: str) -> str:
+    """A name in the genitive."""
+    return f"{name}'" if name.endswith("s") else f"{name}'s"
+
+
 def wrapped(text: str, width: int | None) -> str:
     """Text in lines of at most that width; None leaves it on one line."""
     if width is None:
@@ -86,7 +91,7 @@ def wrapped(text: str, width: int | None) -> str:
 
 
 def terminal_width() -> int:
-    """The width of the terminal in characters; without one COLUMNS, or else 80."""
+    """COLUMNS if it is set, else the width of the terminal in characters; without one 80."""
     return shutil.get_terminal_size().columns
 
 
@@ -109,7 +114,7 @@ def rounded(*values: float) -> list[str]:
     """Numbers to read side by side: whole if one is 100 or more, else with three digits of it."""
     largest = max(abs(value) for value in values)
     decimals = 2 - math.floor(math.log10(largest)) if 0 < largest < 100 else 0
-    return [f"{value:,.{min(decimals, 9)}f}" for value in values]
+    return [f"{value:z,.{min(decimals, 9)}f}" for value in values]
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], width: int | None = None) -> str:
@@ -224,7 +229,7 @@ def _spelled(letter: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A duration as text: 40 s, 7 min, 12.5 h."""
+    """A duration as text: 40 s, 7.0 min, 12.5 h."""
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.1f} {unit}"

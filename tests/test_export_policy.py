@@ -108,6 +108,13 @@ def test_mistakes_are_a_line(run, tmp_path):
     assert f"{other} isn't a policy that jbrep policy export wrote" in mistake(*checking, other)
 
 
+def test_a_policy_of_another_task_is_refused_where_sizes_are_alike(tmp_path):
+    model = tmp_path / "it.onnx"
+    jbrep("policy", "export", "trained", "--task", "move_in_direction", "--out", model)
+    said = mistake("policy", "check", model, "--task", "move_to_pose", "--episodes", 1)
+    assert f"{model} was made for move_in_direction, not for move_to_pose" in said
+
+
 def test_an_encoder_that_is_code_cannot_be_exported(tmp_path):
     trained = randomised("sac", lambda rows: rows[:, :2] * rows[:, 2:4])
     with pytest.raises(InputError, match="the encoder function is code, which a model can't hold"):

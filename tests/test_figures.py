@@ -23,7 +23,7 @@ from jbrep.evaluate.evaluation import (
     Reconstruction,
     Score,
 )
-from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
+from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, observe
 from jbrep.records.document import read_document
 from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, write
 from jbrep.report.figures.claims import claim_plot
@@ -128,10 +128,12 @@ def test_policies_stand_beside_curves_of_the_same_starts_alone(plots, analysis, 
     """Of more starts than the curves have, they would be other numbers."""
     assert "Dashed: policies that don't learn" in plots["representations"].caption
     played = {"face_direction": {"hand-written": [910, 950, 990, 1000]}}
-    _, curves, *_ = study_plots(analysis, returns, played, {})
-    assert "Dashed" not in curves.caption
-    lines = (line for axes in drawn(curves).axes for line in axes.lines)
-    assert not any(line.get_label() == "hand-written" for line in lines)
+    told = {plot.name: plot for plot in study_plots(analysis, returns, played, {})}
+    for name in ("representations", "learning_rate"):  # both of evaluations during training
+        assert "Dashed" in plots[name].caption
+        assert "Dashed" not in told[name].caption
+        lines = (line for axes in drawn(told[name]).axes for line in axes.lines)
+        assert not any(line.get_label() == "hand-written" for line in lines)
 
 
 def test_the_grid_has_tasks_by_algorithms(plots):
@@ -482,7 +484,7 @@ def test_a_constant_drive_turns_the_motor_one_way(behaviours):
 def test_the_heuristic_goes_where_the_target_points(behaviours):
     _, heuristic = behaviours
     assert heuristic.places.sum() == pytest.approx(1)
-    x, y = mean_place(heuristic)
+    x, y = heuristic.mean_place
     assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(45, abs=15)
     assert len(heuristic.returns) == 3
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import mistake
 from made_up import write_record
 from small import adopt, forge
 
@@ -525,6 +526,16 @@ def test_where_the_baseline_did_not_learn_nothing_is_compared(whole, tmp_path):
     assert "**Agents on full didn't learn: nothing can be compared with them.**" in told
     assert "of full's gain" not in told
     assert not re.search(r"slower|faster", told)
+
+
+def test_two_runs_of_one_label_and_seed_are_not_one(tmp_path):
+    plan = make_study(tmp_path / "study")
+    first = plan.folder_of(plan.cells[0])
+    shutil.copytree(first, tmp_path / "runs" / "a")
+    shutil.copytree(first, tmp_path / "runs" / "b")
+    said = mistake("report", tmp_path / "runs")
+    assert "runs/a and " in said
+    assert f"runs/b are both seed 0 of {plan.cells[0].label}: put runs that differ" in said
 
 
 @pytest.mark.usefixtures("one_figure")

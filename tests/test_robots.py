@@ -254,6 +254,7 @@ def test_training_and_evaluation_share_the_one_robot(algorithm, drifts, tmp_path
     told = jbrep(*run, "--out", tmp_path / "run")
     assert told.exit_code == 0, told.output
     assert events(tmp_path) == "oc"
+    assert "standing still" not in told.output  # no policy that doesn't look drives it
     settings = read_run(tmp_path / "run").settings
     assert (settings.preset, settings.hyperparameters.num_envs) == ("modern", 1)
     rows = (tmp_path / "run" / "evaluations.csv").read_text().splitlines()[1:]

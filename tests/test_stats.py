@@ -207,6 +207,16 @@ def test_a_label_whose_runs_all_failed_is_described():
     json.dumps(to_plain(alone.groups), allow_nan=False)
 
 
+def test_what_gains_count_over_is_of_the_starts_of_runs_that_were_evaluated():
+    runs = [make(seed=i, returns=np.full((len(GRID), 5), 300.0)) for i in range(3)]
+    early = make(seed=0, steps=[], returns=[], failed_at=0)
+    played = {"face_direction": {"random": [900.0, 0, 0, 0, 0]}}
+    (group,) = analyse(
+        [early, *(replace(run, seed=run.seed + 1) for run in runs)], references=played
+    ).groups
+    assert group.references["random"].value == 180
+
+
 def test_scalars_of_a_straight_line():
     grid = np.linspace(0, 1000, 101)
     curves = np.stack((grid / 2, np.full(101, 500.0)))

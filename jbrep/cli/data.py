@@ -75,8 +75,9 @@ def _report(out: Path, write: Callable[[], object]) -> None:
     """Let a data set be written; print what the folder holds then, and how fast it was written."""
     from jbrep.dataset import Dataset
     from jbrep.dataset.manifest import MANIFEST, current_manifest
+    from jbrep.records.storage import exists
 
-    before = current_manifest(out).rows if (out / MANIFEST).exists() else 0
+    before = current_manifest(out).rows if exists(out / MANIFEST) else 0
     began = time.monotonic()
     with stoppable(RESUMES):
         write()
@@ -223,6 +224,8 @@ def derive(
         raise InputError("give a --task, or else --hide, --history or --reward")
     if store_state and not task:
         raise InputError("--store-state is for --task: else states stay as the source has them")
+    if threads and not task:
+        raise InputError("--threads is for --task: nothing else is simulated")
     if reward and not is_code(reward):
         raise InputError(f"--reward {reward} must be MODULE:FUNCTION")
     import_code(reward)

@@ -99,10 +99,13 @@ def evaluate_policy(
     from jbrep.encoders.shipped import source_of
     from jbrep.envs.infos import by_name, shares_text
     from jbrep.envs.names import import_code
+    from jbrep.play.sources import is_by_name
 
     import_code(encoder)
     _check_perturbations(perturbations, out)
     zip_file = _Zip(algorithm, trust, vecnormalize)
+    if is_by_name(policy):
+        options["task"] = options["task"] or _TASK
     player = _find(policy, given_task(options), encoder, zip_file)
     source = None if encoder is None else source_of(encoder, player.task)
     if perturbations:
@@ -253,13 +256,10 @@ class _Zip(NamedTuple):
 def _find(policy: str, task: "Task | None", encoder: str | None, zip_file: _Zip) -> "Player":
     """The policy of a run, by name, or in a zip file."""
     from jbrep.encoders import find
-    from jbrep.envs.description import describe
     from jbrep.play import sources
     from jbrep.records.storage import exists
 
     path, folder = Path(policy), sources.run_folder(policy)
-    if sources.is_by_name(policy):
-        task = task or describe(_TASK)
     is_folder = exists(path) and path.is_dir()
     is_zip = not (sources.is_by_name(policy) or sources.is_trained(policy) or is_folder)
     if not is_zip and (unused := [name for name, given in zip_file._asdict().items() if given]):
@@ -342,7 +342,7 @@ def behaviour(
     """
     import numpy as np
 
-    from jbrep.play.behaviour import FAST, FIGURES, SPEEDS, fast_shares, mean_place, observe
+    from jbrep.play.behaviour import FAST, FIGURES, SPEEDS, fast_shares, observe
     from jbrep.play.sources import check_source
     from jbrep.records.storage import check_writable, exists
 
@@ -366,7 +366,7 @@ def behaviour(
             each.name,
             interval_of(each.returns),
             *(f"{100 * share:.0f} %" for share in fast_shares(each)),
-            "{:.2f}, {:.2f}".format(*mean_place(each)),
+            "{:.2f}, {:.2f}".format(*each.mean_place),
         )
         for each in behaviours
     ]

@@ -7,7 +7,13 @@ from typing import Any
 import click
 
 from jbrep.cli.base import PATH, POSITIVE
-from jbrep.cli.environment import environment_options, given_task, task_option
+from jbrep.cli.environment import (
+    environment_options,
+    given_task,
+    retries_option,
+    task_option,
+    threads_option,
+)
 from jbrep.cli.output import say
 from jbrep.errors import InputError
 from jbrep.text import interval_of, returns_text
@@ -62,9 +68,18 @@ def export(policy: str, task: str | None, form: str, out: Path) -> None:
 @click.argument("model", type=PATH)
 @click.option("--run", help="That it was taken from, or trained, to play beside it.")
 @click.option("--episodes", default=20, show_default=True, type=POSITIVE, help="How many.")
+@threads_option
+@retries_option
 @task_option
 @environment_options
-def check(model: Path, run: str | None, episodes: int, **options: Any) -> None:
+def check(
+    model: Path,
+    run: str | None,
+    episodes: int,
+    threads: int | None,
+    retries: int,
+    **options: Any,
+) -> None:
     """Play an exported policy in its environment.
 
     MODEL is an ONNX file that jbrep policy export wrote. It plays the episodes that every run is
@@ -77,10 +92,10 @@ def check(model: Path, run: str | None, episodes: int, **options: Any) -> None:
 
     beside = find_player(run, given_task(options)) if run else None
     player = exported_player(model, beside.task if beside else given_task(options))
-    returns = player.returns(episodes)
+    returns = player.returns(episodes, threads, retries)
     say(f"{player.task.name}, {model}: {returns_text(returns)}")
     if beside:
-        theirs = beside.returns(episodes)
+        theirs = beside.returns(episodes, threads, retries)
         apart = float(np.abs(returns - theirs).max())
         said = f"{beside.name}: {interval_of(theirs)}"
         say(f"{said}; no episode's return differs by more than {apart:.3g}")

@@ -153,8 +153,9 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
     tell(f"returns on {name} at the end: {returns_text(returns)}")
     if told := shares_text(last_infos(read_infos(out), read_evaluations(out))):
         tell(told)
+    is_one_robot = options["threads"] == 1 and not task.reproducible
     with stoppable("the run itself is finished"):
-        if compared := beside(task, returns, min(len(returns), _BESIDE)):
+        if not is_one_robot and (compared := beside(task, returns, min(len(returns), _BESIDE))):
             tell(str(compared))
     source = source_of(options["encoder"], task)
     say(f"encoder: {source}; all evaluations: {out / EVALUATIONS}")

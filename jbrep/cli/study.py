@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from jbrep.cli.base import PATH, RESUMES, Variadic, as_json
+from jbrep.cli.base import PATH, RESUMES, as_json
 from jbrep.cli.environment import import_option
 from jbrep.cli.output import echo_json, echo_paths, echo_text, say, tell
 from jbrep.cli.signals import stoppable
@@ -63,10 +63,12 @@ def study(
     Data sets and encoders are made first. Stopped or killed, the same command resumes the study;
     runs that have ended are never run again.
     """
-    from jbrep.errors import InputError
+    from jbrep.errors import InputError, choose
     from jbrep.records.storage import exists
     from jbrep.records.toml import read_toml
+    from jbrep.study.runner import BACKENDS
 
+    choose(backend, BACKENDS, "backend")
     if dry_run and register:
         raise InputError("--dry-run and --register exclude each other: choose one")
     if not exists(study):
@@ -105,14 +107,14 @@ def _announce(
     return echo_paths([plan.folder / REGISTRATION])
 
 
-@click.command(cls=Variadic, epilog="Example: jbrep report runs/demo")
+@click.command(epilog="Example: jbrep report runs/demo")
 @click.argument("folder", type=PATH)
 @click.option(
     "--evaluation",
     multiple=True,
-    metavar="FOLDER...",
+    metavar="FOLDER",
     help="From jbrep evaluate, of encoders of these runs: its diagnostics go into the tables. "
-    "{task} in it stands for each task.",
+    "{task} in it stands for each task. May be repeated.",
 )
 @click.option(
     "--across-trainers", is_flag=True, help="Compare runs of different trainers or precisions, too."

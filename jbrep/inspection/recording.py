@@ -125,11 +125,13 @@ class Recording:
 
 
 def check_out(path: Path) -> None:
-    """Make sure that only an earlier recording would be overwritten.
+    """Make sure that a recording can be there, and only an earlier one would be overwritten.
 
     Raises:
-        InputError: another kind of file exists there.
+        InputError: it is called otherwise, or another kind of file exists there.
     """
+    if path.suffix != SUFFIX:
+        raise InputError(f"a recording is a file such as {path.with_suffix(SUFFIX)}, not {path}")
     if not exists(path):
         return
     try:

@@ -32,6 +32,7 @@ class Behaviour:
         motor: share of time in each bin of the motor velocity, (b,).
         edges: edges of the floor's cells, the same in x and y [m], (k + 1,).
         places: share of time in each cell, x first, (k, k).
+        mean_place: the mean of where the robot is, x and y (2,) [m].
     """
 
     name: str
@@ -39,6 +40,7 @@ class Behaviour:
     motor: Array
     edges: Array
     places: Array
+    mean_place: Array
 
 
 def observe(
@@ -81,12 +83,6 @@ def fast_shares(behaviour: Behaviour) -> tuple[float, float]:
     """Shares of time in which the motor turns at FAST or more, one way and the other."""
     low, high = SPEEDS[:-1], SPEEDS[1:]
     return behaviour.motor[high <= -FAST].sum(), behaviour.motor[low >= FAST].sum()
-
-
-def mean_place(behaviour: Behaviour) -> tuple[float, float]:
-    """The mean of where the robot is, x and y [m], to a fraction of a cell."""
-    middles = (behaviour.edges[:-1] + behaviour.edges[1:]) / 2
-    return behaviour.places.sum(1) @ middles, behaviour.places.sum(0) @ middles
 
 
 def _short(sources: Sequence[str]) -> list[str]:
@@ -151,4 +147,5 @@ def _counted(name: str, visits: _Visits, edges: Array) -> Behaviour:
     motor, _ = np.histogram(visits.motor.clip(SPEEDS[0], SPEEDS[-1]), SPEEDS)
     x, y = visits.position.T
     places, _, _ = np.histogram2d(x, y, (edges, edges))
-    return Behaviour(name, visits.returns, motor / motor.sum(), edges, places / places.sum())
+    mean = visits.position.mean(axis=0)
+    return Behaviour(name, visits.returns, motor / motor.sum(), edges, places / places.sum(), mean)

@@ -8,7 +8,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from jbrep.envs.recording import Actor, held
-from jbrep.envs.task import Array, Task
+from jbrep.envs.task import Array, Task, check_same
 from jbrep.errors import DamageError, InputError, first_line
 from jbrep.play.player import Player
 from jbrep.records.storage import read_file
@@ -49,10 +49,10 @@ def read_exported(path: Path) -> tuple[Any, Described]:
 
 
 def exported_player(path: Path, task: Task | None = None) -> Player:
-    """The policy in a file, to play its own task or one with the same features.
+    """The policy in a file, to play its own task, maybe with another body or time limit.
 
     Raises:
-        InputError: as `read_exported`, or the task has other features or actions.
+        InputError: as `read_exported`, or it is another task.
     """
     session, said = read_exported(path)
     known = task or said.environment
@@ -66,6 +66,7 @@ def exported_player(path: Path, task: Task | None = None) -> Player:
             f"{path} takes {sizes[0]} numbers and gives {sizes[1]}, but {known.name} observes "
             f"{known.size} and acts by {known.action_size}: give its --task"
         )
+    check_same(known, said.environment, str(path))
 
     def act(observation: Array) -> NDArray[Any]:
         try:

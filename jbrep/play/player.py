@@ -53,6 +53,8 @@ class Player(NamedTuple):
                 f"{self.name} plays {len(episodes):,} episodes of {self.task.max_episode_steps:,} "
                 f"steps at once: at most {_MAX_BYTES // self._episode_bytes:,} are possible"
             )
+        if len(episodes) > 1 and not self.task.reproducible:  # a robot may exist once
+            return [each for episode in episodes for each in self.play([episode], target_yaw)]
         seeds = [EVALUATION_SEED + episode for episode in episodes]
         act, read = self.begin(self.task, seeds), MotionReader()
         with (

@@ -9,11 +9,12 @@ from typing import Any
 
 from jbrep.encoders import FULL
 from jbrep.encoders.base import OWN
+from jbrep.encoders.shipped import UNLEARNED, find, names
 from jbrep.envs.names import modules_of
 from jbrep.records.record import to_plain
 from jbrep.report.tables import Tables
 from jbrep.report.words import shown_number
-from jbrep.rl.files import FAILED
+from jbrep.rl.files import ENCODER, FAILED
 from jbrep.rl.settings import TrainingSettings
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study
@@ -24,6 +25,7 @@ from jbrep.text import SIGNIFICANT, Table, number, slug
 _FEW = 6  # representations that are named
 RUNNING = "running mean and variance"  # of what agents see, where they normalise it
 _NOT_SHOWN = ("task", "representation", "encoder", "encoder_code")  # among the settings
+_KEPT = f"RUN/{ENCODER}"
 _OPTIONS = ("algorithm", "preset", *TrainingSettings.__struct_fields__)  # of jbrep rl
 
 
@@ -260,8 +262,22 @@ def reproduce(tables: Tables) -> list[tuple[str, str]]:
         toml = ("This file, as study.toml:", record.study.toml().rstrip())
         command = f"jbrep study study.toml --out {folder}{_imports(record, record.study)}"
         return [first, toml, ("All runs:", command), report]
-    commands = "\n".join(_command(shared, tables.name) for shared in record.labels.values())
-    return [first, ("Each run, here with one seed:", commands), report]
+    commands = "\n".join(
+        _command(shared, tables.name, _encoder_of(record, label))
+        for label, shared in record.labels.items()
+    )
+    first_seed = "Each run, here with one seed"
+    first_seed += "; an encoder is kept in its run's folder" if _KEPT in commands else ""
+    return [first, (f"{first_seed}:", commands), report]
+
+
+def _encoder_of(record: RunsRecord, label: str) -> str:
+    """How a command names the encoder of a label: one that ships by its name."""
+    shared = record.labels[label]
+    task, name = shared.settings.environment, shared.encoder.name
+    used = {run.encoder for run in record.runs if run.label == label}
+    ships = find(name, task).fingerprint if name in (*names(task), *UNLEARNED) else ""
+    return shared.settings.encoder_code or (name if used == {ships} else _KEPT)
 
 
 def _imports(record: RunsRecord, study: Study) -> str:
@@ -273,8 +289,8 @@ def _imports(record: RunsRecord, study: Study) -> str:
     return "".join(f" --import {shlex.quote(module)}" for module in modules)
 
 
-def _command(shared: Label, folder: str) -> str:
-    """The command that trains one run of a label."""
+def _command(shared: Label, folder: str, encoder: str) -> str:
+    """The command that trains one run of a label on an encoder."""
     settings, task = shared.settings, shared.settings.environment
     view = task.view
     parts = ["jbrep", "rl", "--task", task.name.removesuffix(view.suffix) if view else task.name]
@@ -297,6 +313,7 @@ def _command(shared: Label, folder: str) -> str:
     parts += ["--episode-steps", str(task.max_episode_steps)]
     label = settings.task, settings.learner, settings.representation
     out = "/".join((folder, *map(slug, label), "seed-0"))  # a task's id may contain a slash
-    encoder = settings.encoder_code or shared.encoder.name
+    if settings.begin_from is not None:
+        parts += ["--from", "ANOTHER-RUN"]
     parts += ["--encoder", encoder, "--seed", "0", "--out", out]
     return shlex.join(parts)

@@ -73,9 +73,11 @@ def _how(analysis: Analysis) -> str:
 def _tables(analysis: Analysis) -> list[Table]:
     """Every table of every group, each with a title that names the group; those across tasks."""
     of_groups = [
-        table._replace(title=f"{group.name}. {table.title}") if i else table
+        table
+        if table.title.startswith(group.name)
+        else table._replace(title=f"{group.name}. {table.title}")
         for group in analysis.groups
-        for i, table in enumerate(group_tables(group, analysis))
+        for table in group_tables(group, analysis)
     ]
     return [*of_groups, *across_tasks(analysis)]
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from jbrep.encoders.base import OWN
 from jbrep.evaluate.table import SCALARS
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import inside, make_folder, write_whole
+from jbrep.records.storage import exists, inside, make_folder, write_whole
 from jbrep.report import facts
 from jbrep.report.answer import answer
 from jbrep.report.figures import study_plots, write
@@ -63,7 +63,7 @@ class Report(NamedTuple):
 
     def _repr_html_(self) -> str:
         picture = self.folder / FIGURES / f"{_MAIN_FIGURE}.png"
-        if not picture.exists():
+        if not (self.tables.analysis and exists(picture)):
             return html(repr(self))
         content = base64.b64encode(picture.read_bytes()).decode()
         shown = f'<img width="700" src="data:image/png;base64,{content}">'

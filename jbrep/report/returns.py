@@ -12,7 +12,7 @@ from jbrep.report.words import reference_words, shown, shown_number
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.labels import REACHED, RepresentationResult
 from jbrep.stats.scale import STILL, best_blind
-from jbrep.text import Table
+from jbrep.text import Table, possessive
 
 _MOST_DIGITS = 9  # after the point
 _NOTHING = re.compile(r"-( \(0/\d+\))?")  # cells that say nothing
@@ -66,7 +66,7 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
             if counted_over_still
             else "-"
         ),
-        f"of {analysis.baseline}'s gain": lambda label: (
+        f"of {possessive(analysis.baseline)} gain": lambda label: (
             shown(kept[label.representation], ".2f") if label.representation in kept else "-"
         ),
         **_share_columns(groups, shares),
@@ -81,7 +81,7 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
     title += f", {max(group.grid[-1] for group in groups):,.0f} steps"
     title += "; 95 % intervals over runs" if several else ""
     found = _without_nothing(Table(title, (what, *columns), rows))
-    if f"of {analysis.baseline}'s gain" in found.header:
+    if f"of {possessive(analysis.baseline)} gain" in found.header:
         gained = f"gains are over {first.reference_policy or reference_words(first)}"
         gained += ", as it was registered" if counted_over_still else ""
         counts_all = all(c.counts_all for c in first.comparisons if c.representation in kept)

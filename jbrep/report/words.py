@@ -20,7 +20,7 @@ from jbrep.stats.comparison import Comparison
 from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.scale import STILL
 from jbrep.study.record import RegistrationFacts
-from jbrep.text import SIGNIFICANT, interval, number
+from jbrep.text import SIGNIFICANT, interval, number, possessive
 
 EFFECTS = (  # of `jbrep.stats.power`
     f"Power of {NOT_WORSE.name!r} and {WITHIN_HALF.name!r}: if agents keep all of the gain, and "
@@ -96,8 +96,7 @@ def over(rules: Rules) -> str:
 
 def statements(planned: Planned) -> list[Statement]:
     """What is claimed, in the order of the tests."""
-    found, rules, baseline = [], planned.rules, planned.rules.baseline
-    whose = f"{baseline}'" if baseline.endswith("s") else f"{baseline}'s"
+    found, rules, whose = [], planned.rules, possessive(planned.rules.baseline)
     for name in rules.claims:
         claim = CLAIMS[name]
         percent = f"{100 * (1 - claim.boundary(rules.margin)):.3g} %"

@@ -14,7 +14,7 @@ from jbrep.stats.curves import compared
 from jbrep.stats.intervals import LEVEL, mean_within
 from jbrep.stats.labels import YES, RepresentationResult, describe
 from jbrep.stats.rules import Planned
-from jbrep.stats.runs import Group, RunCurve, groups
+from jbrep.stats.runs import Group, RunCurve, evaluated_run, groups
 from jbrep.stats.scale import SOLVED, scale_of
 
 References = Mapping[str, Mapping[str, Sequence[float]]]  # returns by task and policy
@@ -140,7 +140,7 @@ def _analyse_group(
     planned: Planned,
     seed: int,
 ) -> GroupAnalysis:
-    first, known = next(iter(group.values()))[0], compared(group)
+    first, known = evaluated_run(group), compared(group)
     starts = None if known.on_all_starts else first.returns.shape[1]
     played = {
         policy: mean_within(np.array(returns[:starts]), first.bounds, LEVEL)

@@ -9,7 +9,7 @@ import numpy as np
 from jbrep.stats.bootstrap import Array
 from jbrep.stats.curves import Compared, compared, final_return, steps_to
 from jbrep.stats.intervals import Bounds, surely_above
-from jbrep.stats.runs import Group, RunCurve, with_failure_returns
+from jbrep.stats.runs import Group, RunCurve, evaluated_run, with_failure_returns
 from jbrep.stats.scale import reference_in_training, reference_of
 
 FEWEST_UNITS = 8  # units on either side of a verdict
@@ -85,7 +85,7 @@ def learns(arm: Arm, frame: Frame) -> bool:
 
 
 def _frame(group: Mapping[str, list[RunCurve]], known: Compared) -> Frame:
-    (first, *_), *_ = group.values()
+    first = evaluated_run(group)
     grid, curves, finals = known.grid, known.of_baseline, known.finals
     of_baseline, over = next(iter(finals.values())), reference_in_training(first, curves)
     reference = reference_of(first, curves) if known.on_all_starts else over

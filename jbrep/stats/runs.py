@@ -1,7 +1,7 @@
 """Runs of reinforcement learning: the unit of replication is the run, that is, the seed."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from numbers import Integral
@@ -219,6 +219,11 @@ def groups(runs: Sequence[RunCurve], baseline: str) -> dict[Key, Group]:
     if not by_group:
         raise InputError("there are no runs: give at least two of the baseline")
     return {key: _ordered(by_group[key], key, baseline) for key in sorted(by_group)}
+
+
+def evaluated_run(group: Mapping[str, Sequence[RunCurve]]) -> RunCurve:
+    """A run of a group that was evaluated, if any was: only it says on how many starts."""
+    return max(chain.from_iterable(group.values()), key=lambda run: len(run.steps) > 0)
 
 
 def _ordered(group: Group, key: Key, baseline: str) -> Group:

@@ -132,7 +132,16 @@ def _ended(folder: Path) -> Ended:
             "jbrep study resumes it" if resumed else "train one with jbrep rl or jbrep study"
         )
         raise InputError(f"no finished run below {folder}: {what_to_do}")
-    return {each: read_run(each) for each in folders}
+    ended = {each: read_run(each) for each in folders}
+    known: dict[tuple[str, int], Path] = {}
+    for each, run in ended.items():
+        other = known.setdefault((run.settings.label, run.settings.seed), each)
+        if other != each:
+            raise InputError(
+                f"{other} and {each} are both seed {run.settings.seed} of {run.settings.label}: "
+                "put runs that differ in anything else in folders of their own"
+            )
+    return ended
 
 
 def _comparable(runs: list[RunCurve], baseline: str) -> tuple[list[RunCurve], list[str]]:

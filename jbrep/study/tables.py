@@ -188,7 +188,8 @@ def _there(path: Path, before: Mapping[str, str]) -> list[_Reference]:
 def _played(task: Task, policy: str, episodes: int) -> list[_Reference]:
     """The rows of a task and policy; none where its environment isn't here."""
     try:
-        returns = find_player(_POLICIES[policy], task).returns(episodes)
+        one_by_one = None if task.reproducible else 1  # a robot may exist once
+        returns = find_player(_POLICIES[policy], task).returns(episodes, one_by_one)
     except Exception:  # reports don't need the environments, whatever these lack
         return []
     return [_Reference(task.name, policy, i, rounded(each)) for i, each in enumerate(returns)]

@@ -1,7 +1,7 @@
 """Final returns, their spread, and learning speed: a point for each run, and intervals."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jbrep.report.figures.curves import Groups, below, cell, names_with_runs
+from jbrep.report.figures.curves import Groups, Played, below, cell, names_with_runs
 from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.style import (
     COLUMN,
@@ -59,16 +59,22 @@ def final_return(groups: Groups, looks: Looks) -> Plot:
     )
 
 
-def learning_rate(groups: Groups, looks: Looks) -> Plot:
-    """How fast each representation learns: the mean return over training."""
+def learning_rate(groups: Groups, played: Played, looks: Looks) -> Plot:
+    """How fast each representation learns: the mean return over training.
+
+    Policies that don't learn are beside it where they were `played` on the starts of training.
+    """
     return Plot(
         "learning_rate",
         "How fast agents learn",
         "Mean return over all of training (the area under the learning curve), a point for each of "
-        "n runs, and their mean." + _INTERVALS + _dashed(groups) + _CUT,
+        "n runs, and their mean."
+        + _INTERVALS
+        + (_DASHED if any(group.task in played for group in groups) else "")
+        + _CUT,
         (*_LABEL, "seed", "mean_return", "mean", "mean_low", "mean_high"),
         list(_by_run(groups, "mean_return", ("mean_return_mean",))),
-        lambda: _draw_learning(groups, looks),
+        lambda: _draw_learning(groups, played, looks),
     )
 
 
@@ -138,7 +144,7 @@ def _draw_final(groups: Groups, looks: Looks) -> Figure:
     figure, panels = _panels(groups, 2 if scatter else 1, _height(groups))
     look = looks()
     for (left, *others), group in zip(panels, groups, strict=True):
-        extent = _draw_runs(left, group, look, "final_return", group.solved)
+        extent = _draw_runs(left, group, look, "final_return", _played(group), group.solved)
         if not others:
             continue
         (right,) = others
@@ -152,11 +158,11 @@ def _draw_final(groups: Groups, looks: Looks) -> Figure:
     return figure
 
 
-def _draw_learning(groups: Groups, looks: Looks) -> Figure:
+def _draw_learning(groups: Groups, played: Played, looks: Looks) -> Figure:
     figure, panels = _panels(groups, 1, _height(groups))
     look = looks()
     for (axes,), group in zip(panels, groups, strict=True):
-        _draw_runs(axes, group, look, "mean_return")
+        _draw_runs(axes, group, look, "mean_return", played.get(group.task, {}))
     below(figure, panels.ravel())
     return figure
 
@@ -170,16 +176,21 @@ def _from_zero(axes: Axes, intervals: Sequence[Interval], limit: float) -> None:
 
 
 def _draw_runs(
-    axes: Axes, group: GroupAnalysis, look: Styles, value: str, solved: float = np.nan
+    axes: Axes,
+    group: GroupAnalysis,
+    look: Styles,
+    value: str,
+    played: Mapping[str, float],
+    solved: float = np.nan,
 ) -> Limits:
     """A point for each run of each representation, and the mean with its interval."""
     means = [label.numbers[f"{value}_mean"] for label in group.labels]
-    every = chain(_played(group).values(), *(label.by_run[value] for label in group.labels))
+    every = chain(played.values(), *(label.by_run[value] for label in group.labels))
     extent = limits(every, group.return_floor, solved).with_ends(means, group.return_floor)
     draw_solved(axes.axhline, solved, extent)
     axes.set(ylabel=value.replace("_", " "), ylim=extent.with_room(_ROOM))
     _name_columns(axes, group)
-    draw_policies(axes.axhline, _played(group))
+    draw_policies(axes.axhline, played)
     for i, (label, mean) in enumerate(zip(group.labels, means, strict=True)):
         style, runs = look[label.representation], label.by_run[value]
         beside = i - 0.22 + np.linspace(-_JITTER, _JITTER, len(runs)) * (len(runs) > 1)

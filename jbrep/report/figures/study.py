@@ -42,7 +42,7 @@ def study_plots(
         plots += [final_return(groups, looks), curves(groups, played, looks)]
         if any(group.compares for group in groups):
             plots.append(claim_plot(analysis, looks))
-        plots.append(learning_rate(groups, looks))
+        plots.append(learning_rate(groups, played, looks))
         if any(len(label.seeds) >= FEWEST_RUNS for group in groups for label in group.labels):
             plots.append(profiles(analysis, looks))
         if analysis.aggregates:
