@@ -11,7 +11,7 @@ from command import jbrep
 from small import contents, forge, settings
 
 from jbrep.collect import collect
-from jbrep.collect.backends import make_shard
+from jbrep.collect.backends import make_episodes
 from jbrep.collect.derive import derive
 from jbrep.collect.shards import Simulator
 from jbrep.dataset import Dataset
@@ -106,13 +106,15 @@ def test_a_mixture_that_names_a_run_first_goes_on(runs, tmp_path):
     assert contents(tmp_path / "twice") == contents(gather(text, tmp_path / "once"))
 
 
-def test_a_worker_makes_the_same_shard(runs, tmp_path):
+def test_a_worker_makes_the_same_episodes(runs, tmp_path):
     """Of a network that gives actions in [-1, 1] for what has been normalised before."""
     chosen, actor = some(runs / "sledge", tmp_path, task=SLEDGE, store_state=False, steps=80)
     gather(runs / "sledge", tmp_path / "data", {"num_threads": 1}, task=SLEDGE, store_state=False)
     known = ("environments",), gymnasium.spec(SLEDGE.id)
-    sent = pickle.loads(pickle.dumps((known, Simulator(chosen, actor, 1, 1), 1, 80, 0)))
-    made, dataset = make_shard(*sent).columns, Dataset(tmp_path / "data")
+    each = chosen.shard_episodes
+    second = range(each, 2 * each)
+    sent = pickle.loads(pickle.dumps((known, Simulator(chosen, actor, 1, 1), second)))
+    made, dataset = make_episodes(*sent).columns, Dataset(tmp_path / "data")
     start = dataset.manifest.shards[0].rows
     rows = slice(start, start + len(made["action"]))
     np.testing.assert_array_equal(made["action"], dataset["action"][rows])

@@ -45,16 +45,15 @@ class Remaining:
         each = self.manifest.settings.shard_episodes
         return min(max(self.manifest.episodes - shard * each, 0), each)
 
-    def wants(self, shard: int) -> bool:
-        """Whether a shard of that number is likely to be needed.
+    def wants(self, episode: int) -> bool:
+        """Whether an episode of that number is likely to be needed.
 
-        Judging by the mean of the shards so far, or else by the usual size.
+        Judging by the mean of those that are committed, or else by the usual size of a shard.
         """
-        settings, done = self.manifest.settings, self.manifest.full_shards
-        longest = settings.shard_episodes * settings.task.max_episode_steps
-        rows = sum(entry.rows for entry in self.manifest.shards[:done])
-        mean = rows / done if done else min(longest, SHARD_ROWS)
-        return (shard - done) * mean < self.rows
+        manifest, settings = self.manifest, self.manifest.settings
+        usual = min(settings.task.max_episode_steps, SHARD_ROWS / settings.shard_episodes)
+        mean = manifest.rows / manifest.episodes if manifest.episodes else usual
+        return (episode - manifest.episodes) * mean < settings.steps - manifest.rows
 
 
 # the columns of episodes in order, from the shard of a number on, some of one shard at a time;
@@ -63,9 +62,9 @@ Produce = Callable[[int, Remaining, Tick], Iterator[Columns]]
 
 
 class Made(NamedTuple):
-    """What became of a shard."""
+    """What became of some episodes."""
 
-    columns: Columns | None  # of its episodes before a failure; None if there are none
+    columns: Columns | None  # of those before a failure; None if there are none
     failure: str = ""
 
 
@@ -109,16 +108,11 @@ class Simulator:
         each = self.settings.shard_episodes
         return np.arange(shard * each, (shard + 1) * each)
 
-    def made(self, number: int, tick: Tick, rows: int, begun: int = 0) -> Made:
-        """A shard that ends early once it has enough rows, without the episodes that are there."""
-        blocks: list[Columns] = []
-
-        def wanted() -> float:
-            return rows - sum(len(block["step"]) for block in blocks)
-
-        failure = ""
+    def made(self, episodes: range, tick: Tick) -> Made:
+        """Some episodes of a shard."""
+        blocks, failure = list[Columns](), ""
         try:
-            for block in self._blocks(self._episodes(number)[begun:], tick, wanted):
+            for block in self._blocks(np.array(episodes), tick, lambda: math.inf):
                 blocks.append(block)
         except InputError as error:
             failure = str(error)
