@@ -115,7 +115,7 @@ answer-face-direction: ## results/answer-face-direction/ anew: an hour
 answer-move-from-origin answer-move-in-direction: ## results/answer-move-from-origin/ and -in-direction/ anew: an hour and a half each
 answer-move-to-pose: ## results/answer-move-to-pose/ anew: two hours
 identify-face-direction identify-move-in-direction: ## results/identify-…/ anew: an hour each
-size-face-direction size-move-in-direction: ## results/size-…/ anew: an hour each
+size-face-direction size-move-in-direction size-move-to-position: ## results/size-…/ anew: an hour or more each
 body-1 body-2 body-3: ## results/body-1/, -2/ and -3/ anew: half an hour each
 # the columns of a study's line in studies/judged.txt
 column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
