@@ -130,7 +130,9 @@ def test_the_shard_of_a_killed_worker_is_made_again(tmp_path):
 
 def test_a_shard_that_kills_every_worker_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(backends, "ATTEMPTS", 2)
-    with pytest.raises(InputError, match=r"worker that began with episode 7 was killed 2 times, perhaps"):
+    with pytest.raises(
+        InputError, match=r"worker that began with episode 7 was killed 2 times, perhaps"
+    ):
         collect(some(deadly(tmp_path, 99)), tmp_path / "data", num_threads=2)
     assert len(Dataset(tmp_path / "data").episodes["length"]) <= 7
 

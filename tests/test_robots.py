@@ -18,7 +18,7 @@ from jbrep.collect import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.verify import find_problems
 from jbrep.encoders.wrapper import Encoded
-from jbrep.envs import Lanes, describe, instances
+from jbrep.envs import Lanes, describe, instances, origin
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.make import make_env
 from jbrep.envs.names import import_modules
@@ -139,6 +139,17 @@ def own_module(tmp_path, monkeypatch):
     for name in ("robot42", "gears42"):
         sys.modules.pop(name, None)
     gymnasium.registry.pop("Own/Robot-v0", None)
+
+
+def test_a_folder_of_very_many_files_is_known_by_their_names_and_sizes(tmp_path, monkeypatch):
+    monkeypatch.setattr(origin, "_MOST_FILES", 2)
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    for name in "abc":
+        (maps / name).write_text("rock")
+    before = origin.files_of({"maps": f"{maps}/"})
+    (maps / "c").write_text("rocks")
+    assert origin.files_of({"maps": f"{maps}/"}) != before
 
 
 def test_a_run_of_another_robot_is_not_resumed(own_module, tmp_path):

@@ -319,7 +319,8 @@ def usual_shard_episodes(
     """Episodes in a shard of the usual size, judging by the data set's first few.
 
     A batch's shards have 100,000 steps, each with all threads; other environments' 20,000, since
-    they are made side by side. A data set that is there already keeps its own number.
+    they are made side by side. A data set that is there already keeps its own number. Where no
+    episode can be played again, a robot may exist once: none is played for this.
 
     Raises:
         InputError: the manifest in the folder can't be read, or the environment fails more than
@@ -329,7 +330,7 @@ def usual_shard_episodes(
         return read_manifest(folder).settings.shard_episodes
     task = settings.task
     length = float(task.max_episode_steps)
-    if task.terminates is not False:
+    if task.terminates is not False and task.reproducible:
         policy = policy or make_policy(settings.policy)
         pilot = settings.replace(shard_episodes=_PILOT)
         columns = Simulator(pilot, policy, retries=retries).shard(0, lambda steps: None)

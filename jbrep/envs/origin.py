@@ -22,9 +22,10 @@ from jbrep.envs.task import Task, changed_parts
 
 _MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")  # of files that name others
 _NAMED = re.compile(r"""\b(?:file(?:name)?|\w*dir)\s*=\s*["']([^"']+)["']""")
-_MOST_FILES = 1000  # of a folder
+_MOST_FILES = 1000  # of a folder, whose contents are hashed
+_LIBRARIES = ("stdlib", "platstdlib", "purelib", "platlib")
 _INSTALLED = (  # code that packages' versions stand for
-    *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib")),
+    *(Path(sysconfig.get_path(name)).resolve() for name in _LIBRARIES),
     Path(__file__).resolve().parents[1],
 )
 
@@ -53,7 +54,7 @@ def files_of(arguments: Mapping[str, Any]) -> dict[str, str]:
     hashes: dict[str, str] = {}
     for name, value in arguments.items():
         if paths := list(_paths(value)):
-            contents = [_digest(each) for path in paths for each in _with_named(path)]
+            contents = [each for path in paths for each in _contents(path)]
             hashes[name] = hashlib.sha256("".join(contents).encode()).hexdigest()
     return hashes
 
@@ -125,11 +126,18 @@ def _paths(argument: Any) -> Iterator[Path]:
             yield from _paths(each)
 
 
+def _contents(path: Path) -> list[str]:
+    """SHA-256 of each file of a path; of a folder of very many their names and sizes."""
+    files = _with_named(path)
+    if len(files) <= _MOST_FILES or not path.is_dir():
+        return [_digest(each) for each in files]
+    return [f"{each.relative_to(path)} {each.stat().st_size}" for each in files]
+
+
 def _with_named(path: Path) -> list[Path]:
     """A file with those that it names in turn, if it is a robot's model; the files of a folder."""
     if path.is_dir():
-        files = sorted(each for each in path.rglob("*") if each.is_file())
-        return files if len(files) <= _MOST_FILES else []
+        return sorted(each for each in path.rglob("*") if each.is_file())
     found = [path]
     for model in found:  # which grows
         if model.suffix.lower() not in _MODEL_SUFFIXES:
