@@ -168,6 +168,23 @@ def test_what_a_policy_lacks_is_named(tmp_path):
         load_policy(path)
 
 
+@pytest.mark.parametrize(
+    ("changes", "activation", "message"),
+    [
+        ({f"policy.mu.{'9' * 5000}.weight": np.zeros((1, 1))}, "relu", "doesn't fit the run's"),
+        ({"policy.mu.weight": np.zeros((1, 3))}, "relu", "takes 3 numbers"),
+        ({}, "zzz", "activation"),
+    ],
+)
+def test_a_policy_that_makes_no_network_is_refused(changes, activation, message, tmp_path):
+    tensors, header = container.read(find_shipped(describe("face_direction")), "policy")
+    header["settings"]["hyperparameters"]["policy_kwargs"]["activation_fn"] = activation
+    changed = {name: each.astype(np.float32) for name, each in changes.items()}
+    container.write(tmp_path / "policy.safetensors", tensors | changed, header)
+    with pytest.raises(InputError, match=message):
+        load_policy(tmp_path / "policy.safetensors")
+
+
 def test_what_it_cannot_act_on_is_refused():
     controller = controller_of(randomised("td3", "full"))
     with pytest.raises(InputError, match=f"takes observations of {TASK.size} numbers, but got"):

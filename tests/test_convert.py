@@ -333,6 +333,10 @@ CHAINS = {
         "e = Exp x; p = Add e o; l = Log p; g = Greater x t; y = Where g x l",
         {"o": single(1), "t": single(20)},
     ),
+    "whole constants": (
+        [node("i = Cast w", to=7), node("f = Cast i", to=1), node("y = MatMul x f")],
+        {"w": 3 * f32(16, 4)},
+    ),
     "float64": ([node("a = Cast x", to=11), node("y = MatMul a w")], {"w": np.eye(16) * 2}),
 }
 

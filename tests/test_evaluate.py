@@ -569,12 +569,15 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
 
 def test_whether_an_encoder_may_have_seen_the_episodes(data):
     fingerprint = data.dataset.manifest.fingerprint
-    for source, seed, expected in (
-        (fingerprint, 3, "no test row"),
-        ("other", 3, "maybe"),
-        ("other", 4, "none"),
+    for source, seed, policy, expected in (
+        (fingerprint, 3, {}, "no test row"),
+        ("other", 3, {}, "maybe"),
+        ("other", 4, {}, "none"),
+        ("other", 4, {"policy": {"kind": "imported"}}, "maybe"),
+        ("other", 4, {"policy": 3}, "none"),  # as a stranger may write it
+        ("other", 4, {"policy": {"kind": ["x"]}}, "none"),
     ):
-        known = {"fingerprint": source, "seed": seed}
+        known = {"fingerprint": source, "seed": seed, **policy}
         assert seen(make(data, principal_code(data, 2), data=known), data) == expected
 
 

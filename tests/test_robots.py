@@ -19,6 +19,7 @@ from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.verify import find_problems
 from jbrep.encoders.wrapper import Encoded
 from jbrep.envs import Lanes, describe, instances, origin
+from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.make import make_env
 from jbrep.envs.names import import_modules
@@ -256,8 +257,12 @@ def test_one_instance_describes_collects_and_evaluates(tmp_path):
 
 @pytest.mark.parametrize("algorithm", ["sac", "ppo"])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_training_and_evaluation_share_the_one_robot(algorithm, drifts, tmp_path):
+def test_training_and_evaluation_share_the_one_robot(algorithm, drifts, tmp_path, monkeypatch):
     """Evaluations wait for the end of an episode; normalised observations are the new ones."""
+    begun, restart = [], AutoresetLanes.restart
+    monkeypatch.setattr(
+        AutoresetLanes, "restart", lambda lanes: begun.append(lanes) or restart(lanes)
+    )
     run = ("rl", *arm(tmp_path, drifts=drifts), "--algorithm", algorithm, "--normalize")
     small = "learning_starts=10" if algorithm == "sac" else "n_steps=32"
     run = (*run, "--set", small, "--set", "batch_size=8", "--evaluate-every", 40)
@@ -272,6 +277,7 @@ def test_training_and_evaluation_share_the_one_robot(algorithm, drifts, tmp_path
     steps = list(dict.fromkeys(int(row.split(",")[0]) for row in rows))
     assert steps == [0, 50, 100, 125, 128]
     assert len(rows) == 11
+    assert len(begun) == 4  # not after the last
 
 
 def test_what_fails_is_closed_kept_and_tried_again(tmp_path):

@@ -459,3 +459,9 @@ def test_tensorboard_keeps_what_was_logged_at_the_step_of_a_checkpoint(tmp_path)
         scalars.close()
     events = EventAccumulator(str(tmp_path)).Reload()
     assert [e.step for e in events.Scalars("evaluation")] == [20, 40, 50]
+
+
+def test_the_header_of_a_run_of_very_many_episodes_is_seen(tmp_path):
+    episodes = "x" * (17 << 20)
+    container.write(tmp_path / "it.safetensors", {}, {"episodes": episodes})
+    assert container.peek(tmp_path / "it.safetensors") == {"episodes": episodes}

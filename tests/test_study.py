@@ -256,6 +256,11 @@ def test_what_the_environment_rules_out_is_said_first(changes, message, tmp_path
     assert not (tmp_path / "it").exists()
 
 
+def test_coordinates_need_no_data_and_no_file(tmp_path):
+    study = TINY.replace(tasks=("Hopper-v5",), representations=("full", "coordinates"))
+    check(Plan(study, tmp_path / "it"))
+
+
 @pytest.mark.parametrize("way", [(), ("--register",), ("--dry-run",)])
 def test_data_whose_seeds_an_environment_does_not_take_are_refused_first(way, tmp_path):
     pytest.importorskip("shimmy")

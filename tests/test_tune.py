@@ -12,7 +12,7 @@ from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import POLICY, read_run, runs_below
 from jbrep.rl.learner import read_preset
 from jbrep.rl.tracker import Tracker
-from jbrep.rl.tune import BEST, tune
+from jbrep.rl.tune import BEST, _space, tune
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
 RUN = Run.of(
@@ -23,6 +23,14 @@ RUN = Run.of(
     evaluation_episodes=1,
     overrides={"net_arch": [8]},
 )
+
+
+@pytest.mark.parametrize(("preset", "searched"), [("paper", False), ("modern", True)])
+def test_steps_between_rollouts_are_searched_where_gradient_steps_follow(preset, searched):
+    """Else a thousand gradient steps, meant for a thousand of the robot's, could follow each."""
+    run = Run.of(TASK, "td3", preset=preset, steps=1000)
+    gradient_steps = run.learner.hyperparameters.algorithm_kwargs.get("gradient_steps")
+    assert ("train_freq" in _space(run)) == (gradient_steps is None) == searched
 
 
 def test_a_stopped_search_resumes_to_the_same_trials(tmp_path):

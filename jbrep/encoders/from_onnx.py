@@ -187,7 +187,8 @@ def _fold(
     What no later node uses is dropped: it may be large.
     """
     for node in nodes:
-        said = f"{node.op_type} ({node.name or node.output[0]})"[:_MOST_LETTERS]
+        named = node.name or ", ".join(node.output)
+        said = f"{node.op_type} ({named})"[:_MOST_LETTERS]
         if node.domain not in ("", "ai.onnx"):
             raise InputError(refusal(f"{node.domain}.{said}", "it is no operation of ONNX itself"))
         try:
@@ -200,7 +201,7 @@ def _fold(
                 continue
         except InputError as error:
             raise InputError(refusal(said, error)) from None
-        except (IndexError, TypeError, ValueError, KeyError) as error:
+        except (AttributeError, IndexError, TypeError, ValueError, KeyError) as error:
             raise InputError(refusal(said, first_line(error))) from None
         values[node.output[0]] = fold.take(said, action, given.values)
         uses.subtract(node.input)
@@ -257,8 +258,10 @@ class _Node:
             ((kind, value),) = self.attributes.items()
             return _array(value) if kind == "value" else np.asarray(value)
         first, second = self.given(0), self.given(1)
-        if self.operation in ("Identity", "Cast"):
+        if self.operation == "Identity":
             return first
+        if self.operation == "Cast":
+            return first.astype(helper.tensor_dtype_to_np_dtype(self.attributes["to"]))
         if self.operation == "Transpose":
             return np.transpose(first, self.attributes.get("perm"))
         if self.operation in _SHAPES and second is not None:

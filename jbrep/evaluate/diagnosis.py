@@ -260,7 +260,9 @@ def seen(encoder: BaseEncoder, data: ScaledDataset) -> Literal["no test row", "n
     manifest = data.dataset.manifest
     if source.get("fingerprint") == manifest.fingerprint:
         return "no test row"
-    kinds = {source.get("policy", {}).get("kind"), manifest.settings.policy["kind"]}
+    policy = source.get("policy")
+    kinds = [manifest.settings.policy["kind"]]
+    kinds += [policy.get("kind")] if isinstance(policy, Mapping) else []
     if "seed" not in source or IMPORTED in kinds:
         return "maybe"
     return "none" if source["seed"] != manifest.settings.seed else "maybe"

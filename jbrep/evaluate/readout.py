@@ -208,7 +208,8 @@ def dynamics(encoder: BaseEncoder, held_out: HeldOut) -> Dynamics:
 
 def _steps(encoder: BaseEncoder, held_out: HeldOut, rows: Rows) -> _Steps:
     dataset = held_out.data.dataset
-    chosen = held_out.followed(sample_rows(rows, _ROWS, held_out.data.task.size))
+    width = max(held_out.data.task.size, encoder.latent_size)
+    chosen = held_out.followed(sample_rows(rows, _ROWS, width))
     latent, next_latent = (encoder.encode(dataset["observation"][r]) for r in (chosen, chosen + 1))
     change = changes(held_out.data.task, dataset["observation"], chosen, 1)
     return _Steps(chosen, latent, dataset["action"][chosen], next_latent, change)
@@ -241,7 +242,7 @@ def neighbours(encoder: BaseEncoder, held_out: HeldOut) -> Neighbours:
     from sklearn.neighbors import NearestNeighbors
 
     data = held_out.data
-    size = data.task.size
+    size = max(data.task.size, encoder.latent_size)
     test = sample_rows(data.test, _QUERIES, _NEIGHBOURS * size)
     train = sample_rows(data.train, _REFERENCES, size)
     queries, references = (data.dataset["observation"][rows] for rows in (test, train))
@@ -275,7 +276,7 @@ def correlation(encoder: BaseEncoder, held_out: HeldOut) -> Correlation:
     `state_dimensions` says how many there are. The rows are a sample of at most 50,000.
     """
     data = held_out.data
-    size = data.task.size
+    size = max(data.task.size, encoder.latent_size)
     test = sample_rows(data.test, _CORRELATED, size)
     observation = data.dataset["observation"][test]
     truth = state(data.task, observation)

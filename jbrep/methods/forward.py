@@ -32,6 +32,7 @@ from jbrep.training.settings import (
 from jbrep.training.windows import Windows
 
 _FITTED = 200_000  # windows to which targets are standardised
+_FITTED_NUMBERS = 1 << 26  # at most in these targets: 256 MiB
 _SMALL = 1e-6  # standard deviation of a target that says nothing
 
 
@@ -168,7 +169,8 @@ class ForwardObjective(Objective):
 
     def prepare(self, windows: Windows) -> None:
         """Fit the standardisation of the targets."""
-        step = -(-len(windows) // _FITTED)
+        of_each = len(self._horizons) * sum(self._sizes)
+        step = -(-len(windows) // min(_FITTED, max(1, _FITTED_NUMBERS // of_each)))
         deviation, self._mean = torch.std_mean(
             self.batch(windows, windows.numbers[::step]).targets, 2, keepdim=True
         )

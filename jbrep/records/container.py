@@ -17,6 +17,7 @@ from jbrep.records.storage import MissingFileError, open_regular, read_regular, 
 Tensors = dict[str, NDArray[Any]]
 
 MAX_BYTES = 1 << 24  # that `read` accepts unless told otherwise
+_MAX_HEADER = 100_000_000  # bytes, as safetensors has it
 _KEY = "jbrep"  # of the header in the file's metadata
 _CHECKSUM = "sha256"  # of the rest of the header and all tensors, in the header
 
@@ -100,7 +101,7 @@ def peek(path: Path) -> dict[str, Any]:
             return {}
         with file:
             start = file.read(8)
-            start += file.read(min(int.from_bytes(start, "little"), MAX_BYTES))
+            start += file.read(min(int.from_bytes(start, "little"), _MAX_HEADER))
         header = _header(start)
         header.pop(_CHECKSUM, None)
         return header

@@ -12,10 +12,10 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.file import load
 from jbrep.encoders.fold import Chain
-from jbrep.encoders.layers import Layer, activate, run
+from jbrep.encoders.layers import ACTIVATIONS, Layer, activate, run
 from jbrep.envs.recording import held
 from jbrep.envs.view import Window
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import DamageError, InputError, choose, first_line
 from jbrep.records.container import Tensors
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, POLICY, RUN, read_finished
@@ -183,6 +183,7 @@ def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[La
     if shape.algorithm_kwargs.get("use_sde") or shape.policy_kwargs.get("use_sde"):
         raise InputError("a policy with use_sde isn't a chain of layers: it can't be taken out")
     activation = str(shape.policy_kwargs.get("activation_fn")).replace("_", "-")
+    choose(activation, ACTIVATIONS, "activation")
     chain = Chain(inputs)
     for prefix in _HIDDEN:
         parts = _numbered(prefix, weights)
@@ -266,3 +267,9 @@ def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
         return Controller(settings, encoder, weights, statistics)
     except KeyError as error:
         raise InputError(f"{file.path} doesn't fit the run's settings: it has no {error}") from None
+    except InputError:
+        raise
+    except ValueError as error:  # of shapes, or of numbers in names
+        raise InputError(
+            f"{file.path} doesn't fit the run's settings: {first_line(error)}"
+        ) from None

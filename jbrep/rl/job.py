@@ -85,7 +85,7 @@ class Job:
     Attributes:
         run: what to train.
         folder: where; it need not exist yet.
-        threads: that may step its robots; gradient steps take one.
+        threads: that may step its robots; gradient steps take one. None: one, or all beside a GPU.
         retries: how often in a row an environment that fails is made anew.
         is_one_robot: whether training and evaluations have the same instance of the environment;
             evaluations then wait for the end of an episode of training.
@@ -101,7 +101,7 @@ class Job:
         self,
         run: Run,
         folder: Path,
-        threads: int = 1,
+        threads: int | None = None,
         retries: int = 0,
         is_one_robot: bool = False,
     ):
@@ -117,8 +117,8 @@ class Job:
 
     def threads_for(self, lanes: int) -> int:
         """How many threads step so many of its robots; no bit depends on it."""
-        is_alone = self.settings.device != CPU  # studies have a process for each core otherwise
-        return min(cores() if is_alone else self.threads, lanes)
+        alone = self.settings.device != CPU  # studies have a process for each core otherwise
+        return min(self.threads or (cores() if alone else 1), lanes)
 
     @property
     def result(self) -> RunRecord | None:

@@ -12,7 +12,7 @@ from jbrep.rl.job import Ended, Job, Session
 from jbrep.rl.run import Run
 from jbrep.rl.sb3 import train_in_turn
 from jbrep.rl.settings import COHORT, SB3
-from jbrep.training.trainer import single_torch_thread
+from jbrep.training.trainer import single_thread
 
 _ALONE = Session()
 _FUNCTIONS = {COHORT: train_together, SB3: train_in_turn}
@@ -54,7 +54,7 @@ def train_jobs(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
             if not job.result:
                 make_folder(job.folder, OWN)
                 stack.enter_context(exclusive(job.folder))
-        stack.enter_context(single_torch_thread())
+        stack.enter_context(single_thread())
         results = {job: job.result for job in jobs}
         yield from ((job, result) for job, result in results.items() if result)
         for trainer, train_own in _FUNCTIONS.items():

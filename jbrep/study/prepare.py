@@ -10,7 +10,7 @@ from jbrep.collect.derive import derive
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.encoders import FULL
-from jbrep.encoders.shipped import names
+from jbrep.encoders.shipped import UNLEARNED, find, names
 from jbrep.envs.names import is_code
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
@@ -89,6 +89,9 @@ def _check_encoder(run: Run) -> None:
 
 
 def _check_shipped(representation: ByName, task: Task) -> None:
+    if representation.name in UNLEARNED:
+        find(representation.name, task)  # may refuse the task
+        return
     shipped = names(task) or (FULL,)
     if representation.name not in shipped:
         raise InputError(

@@ -131,6 +131,7 @@ def run_study(
     with exclusive(plan.folder):
         plan.write()
         prepare(plan)
+        packs = packed(plan, workers, width)  # by the sizes of encoders that are there now
         if plan.study.verdicts.primary and not plan.has_begun:
             plan.register()
         for cell in plan.cells:  # so that any mistake shows before the first run

@@ -22,16 +22,22 @@ from jbrep.rl.cohort.networks import Stack
 from jbrep.rl.cohort.replay import ReplayBuffer, capacity_of
 from jbrep.rl.job import Job
 
+_REPLAY = "replay"  # the name of what a replay buffer holds, in a snapshot
+
 
 class Cohort:
     """n members that act and learn at once.
 
-    Attributes:
+    Args:
         members: which can learn together, see `jbrep.rl.cohort.trainer`.
+        replay: theirs, if it is there.
+
+    Attributes:
+        members: which learn together.
         agent_step: of training, over the lanes of a member.
     """
 
-    def __init__(self, members: Sequence[Member]):
+    def __init__(self, members: Sequence[Member], replay: ReplayBuffer | None = None):
         job = members[0].job
         settings, task = job.settings, job.run.task
         self.members, self.agent_step, self._n_updates = members, 0, 0
@@ -40,8 +46,8 @@ class Cohort:
         self._size = padded_size(job)
         sizes = self._size, task.action_size
         looks = self._shared.n_steps, self._shared.gamma
-        capacity = capacity_of(job.run)
-        self._replay = ReplayBuffer(len(members), self._lanes, capacity, *sizes, *looks)
+        of_all = len(members), self._lanes, capacity_of(job.run)
+        self._replay = replay or ReplayBuffer(*of_all, *sizes, *looks)
         self._device = torch.device(settings.device)
         agents = [member.agent for member in members]
         self._stack = Stack(agents, self._size, settings.precision, settings.device)
@@ -205,13 +211,17 @@ class Cohort:
         for member in self.members:
             if not member.failure:
                 member.evaluate(evaluation)
+
+    def evaluate_amid(self) -> None:
+        """Evaluate between steps of training, whose episodes go on or, of one robot, begin anew."""
+        self.evaluate()
         if self.members[0].job.is_one_robot:
             self._observation = self._encode(self._robots.restart())
 
     def evaluate_if_due(self, keep_checkpoint: bool) -> None:
         """Evaluate, if it is time; see `RunSettings.is_evaluation_due`."""
         if self.members[0].job.is_evaluation_due(self.step, self._episode_ended, keep_checkpoint):
-            self.evaluate()
+            self.evaluate_amid()
 
     def close(self) -> None:
         """Free what the environments hold."""
@@ -235,12 +245,19 @@ class Cohort:
         return self.members[lane // self._lanes]
 
     def survivors(self) -> tuple["Cohort", list[Snapshot]]:
-        """A cohort of those that haven't failed, and what restores it as far as they are."""
+        """A cohort of those that haven't failed, and what restores it as far as they are.
+
+        It has the memory of their replay buffers, which aren't in the snapshots.
+        """
         self.write_to_agents()
-        going = [member for member in self.members if not member.failure]
-        snapshots = [self.take(member) for member in going]
+        going = [number for number, member in enumerate(self.members) if not member.failure]
+        members = [self.members[number] for number in going]
+        snapshots = [self.take(member) for member in members]
+        for snapshot in snapshots:
+            del snapshot.tensors[_REPLAY]
         self.close()
-        return Cohort(going), snapshots
+        self._replay.keep(going)
+        return Cohort(members, self._replay), snapshots
 
     def take(self, member: Member) -> Snapshot:
         """Everything that decides how a member's training continues, whoever is beside it.
@@ -252,7 +269,7 @@ class Cohort:
         own = slice(number * self._lanes, (number + 1) * self._lanes)
         tensors |= {f"{LANES}{name}": each[own] for name, each in self._robots.state.items()}
         tensors |= {"observation": self._observation[number]}
-        tensors |= {"replay": self._replay.rows_of(number)}
+        tensors |= {_REPLAY: self._replay.rows_of(number)}
         return Snapshot(tensors, {**counters, "added": self._replay.added})
 
     def restore(self, snapshots: Sequence[Snapshot]) -> None:
@@ -267,7 +284,8 @@ class Cohort:
         self.agent_step, self._n_updates = self._shared.num_timesteps, self._shared._n_updates
         tensors = [each.tensors for each in snapshots]
         self._observation = np.stack([each["observation"] for each in tensors])
-        self._replay.restore((e.pop("replay") for e in tensors), snapshots[0].counters["added"])
+        if _REPLAY in tensors[0]:
+            self._replay.restore((e.pop(_REPLAY) for e in tensors), snapshots[0].counters["added"])
         lanes = [without(LANES, each) for each in tensors]
         self._robots.restore({n: joined([each[n] for each in lanes]) for n in lanes[0]})
 

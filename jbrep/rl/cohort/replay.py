@@ -1,6 +1,6 @@
 """Replay buffers of n agents."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +76,12 @@ class ReplayBuffer:
     def rows_of(self, agent: int) -> Float32:
         """What is there of an agent, (filled, lanes, width); a view."""
         return self._rows[agent, : self.filled]
+
+    def keep(self, agents: Sequence[int]) -> None:
+        """Forget the other agents; those that are left move up, in the same memory."""
+        for place, agent in enumerate(agents):
+            self._rows[place] = self._rows[agent]
+        self._rows = self._rows[: len(agents)]
 
     def restore(self, rows: Iterable[Float32], added: int) -> None:
         """Put back what `rows_of` gave of each agent, after so many steps had been added."""

@@ -70,7 +70,7 @@ def _train(begun: list[_Begun], session: Session) -> Iterator[Ended]:
     try:
         _begin(cohort, [snapshot for _, snapshot in begun if snapshot])
         if not everyone[0].job.history.evaluations:
-            cohort.evaluate()
+            cohort.evaluate_amid()
         while cohort.goes_on:
             if cohort.failed:
                 yield from map(_end, cohort.failed)
