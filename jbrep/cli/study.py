@@ -66,14 +66,15 @@ def study(
     from jbrep.errors import InputError, choose
     from jbrep.records.storage import exists
     from jbrep.records.toml import read_toml
-    from jbrep.study.runner import BACKENDS
 
-    choose(backend, BACKENDS, "backend")
     if dry_run and register:
         raise InputError("--dry-run and --register exclude each other: choose one")
     if not exists(study):
         raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)
+    from jbrep.study.runner import BACKENDS  # imports torch
+
+    choose(backend, BACKENDS, "backend")
     folder = out or Path("runs") / study.stem
     if dry_run or register:
         _announce(study, folder, dry_run, workers, width)

@@ -130,9 +130,10 @@ def check_out(path: Path) -> None:
     Raises:
         InputError: it is called otherwise, or another kind of file exists there.
     """
-    if path.suffix != SUFFIX:
-        raise InputError(f"a recording is a file such as {path.with_suffix(SUFFIX)}, not {path}")
     if not exists(path):
+        if path.suffix != SUFFIX:
+            name = path.with_suffix(SUFFIX)
+            raise InputError(f"a recording is a file such as {name}, not {path}")
         return
     try:
         file = open_regular(path)
