@@ -267,6 +267,12 @@ def forged(encoder, path, **changes):
         ({"header": {"decoder": ["tanh", 1]}}, r"decoder\[1\] is 1: it must be text"),
         ({"header": {"name": "\x1b[2J"}}, "must be lower-case letters, digits and hyphens"),
         ({"header": {"metrics": 3}}, "metrics is 3: it must be a table"),
+        ({"header": {"metrics": {"spectrum": 5}}}, "metrics.spectrum is 5: it must be a list"),
+        (
+            {"header": {"metrics": {"spectra": [1]}}},
+            r"metrics.spectra is \[1\]: it must be a table",
+        ),
+        ({"header": {"metrics": {"loss_by_term": {"x": "y"}}}}, "metrics.loss_by_term"),
         ({"header": {"metrics": {"held_out_mse": float("inf")}}}, "all numbers finite"),
         ({"header": {"environment": 7}}, "environment is 7: it must be a table"),
         ({"header": {"environment": {}}}, "environment.id is missing"),

@@ -1,6 +1,7 @@
 """What an encoder's file says of the encoder, beside its numbers."""
 
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
@@ -10,7 +11,7 @@ from jbrep.encoders.names import Name
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.document import Document
-from jbrep.records.record import to_plain
+from jbrep.records.record import Record, from_plain, to_plain
 
 FULL = "full"  # name and kind of the encoder that only scales: the whole observation
 IMPORTED = "imported"  # the kind of encoder that was trained elsewhere
@@ -18,6 +19,19 @@ HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has, unless it wa
 MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
 
 _Words = tuple[str, ...]
+_Steps = Annotated[str, Meta(pattern=r"\A[1-9][0-9]{0,8}\Z", title="a number of steps")]
+
+
+class _Told(Record, frozen=True, kw_only=True, forbid_unknown_fields=False):
+    """What methods say of their fits, as figures show it; they may say more."""
+
+    spectrum: tuple[float, ...] | None = None
+    spectra: Mapping[_Steps, tuple[float, ...]] | None = None  # by lag
+    loss_by_horizon: Mapping[_Steps, Mapping[str, float]] | None = None
+    loss_by_term: Mapping[str, float] | None = None
+    divergence: tuple[float, ...] | None = None  # of each unit
+    train_loss: float | None = None
+    test_loss: float | None = None
 
 
 class EncoderHeader(Document, frozen=True):
@@ -76,5 +90,6 @@ class EncoderHeader(Document, frozen=True):
             json.dumps(to_plain(self), allow_nan=False)
         except (TypeError, ValueError, RecursionError):
             raise InputError("it must be plain JSON, all numbers finite") from None
+        from_plain(self.metrics, _Told, "metrics")
         if len(set(self.keep)) < len(self.keep):
             raise InputError("what it keeps must be different features")
