@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from click.shell_completion import ShellComplete
-from command import jbrep
+from command import jbrep, mistake
 from stable_baselines3 import A2C
 from test_study import TOML
 
@@ -421,3 +421,21 @@ def test_a_stop_that_comes_while_an_object_is_destroyed_is_not_lost(capsys):
     assert stopped.value.code == 130
     assert sys.unraisablehook is usual
     assert capsys.readouterr().err == "stopped; nothing is lost\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("study studies/demo.toml --dry-run --backend zzz", "unknown backend 'zzz'"),
+        ("data derive x --hide y --threads 2 --out z", "--threads is for --task"),
+        ("inspect heuristic --out it.txt", "a recording is a file such as it.rrd, not it.txt"),
+        ("report --evaluation judged nothing", "nothing"),
+    ],
+)
+def test_what_would_do_nothing_or_something_else_is_refused(line, told):
+    assert told in mistake(*line.split())
+
+
+def test_a_policy_by_its_name_has_a_task_whatever_else_is_said_of_it():
+    done = jbrep("evaluate-policy", "still", "--episode-steps", 5, "--episodes", 1, "--json")
+    assert json.loads(done.stdout)["task"] == "face_direction"
