@@ -326,7 +326,7 @@ def train(
         StoppedError: `stop` was true.
     """
     from jbrep.envs.description import as_task
-    from jbrep.envs.make import is_batched
+    from jbrep.envs.make import is_one_robot
     from jbrep.machine import cores
     from jbrep.rl.bar import Bar
     from jbrep.rl.job import Job, Session
@@ -335,7 +335,7 @@ def train(
     from jbrep.rl.trainers import train_jobs
 
     known = as_task(task)
-    is_one = threads == 1 and not is_batched(known)
+    is_one = is_one_robot(known, threads)
     preset = preset or (MODERN if is_one else "")
     run = Run.of(known, algorithm, preset, overrides, encoder=encoder, seed=seed, **settings)
     if is_one and run.learner.hyperparameters.num_envs > 1:

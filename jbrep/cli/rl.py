@@ -134,7 +134,7 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
         from jbrep import api
         from jbrep.encoders.shipped import source_of
         from jbrep.envs.infos import shares_text
-        from jbrep.envs.make import is_batched
+        from jbrep.envs.make import is_one_robot
         from jbrep.rl.checkpoint import StoppedError  # imports torch
         from jbrep.rl.files import EVALUATIONS, last_infos, read_evaluations, read_infos
         from jbrep.study.single import beside
@@ -154,9 +154,9 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
     tell(f"returns on {name} at the end: {returns_text(returns)}")
     if told := shares_text(last_infos(read_infos(out), read_evaluations(out))):
         tell(told)
-    is_one_robot = options["threads"] == 1 and not is_batched(task)
+    alone = is_one_robot(task, options["threads"])
     with stoppable("the run itself is finished"):
-        if not is_one_robot and (compared := beside(task, returns, min(len(returns), _BESIDE))):
+        if not alone and (compared := beside(task, returns, min(len(returns), _BESIDE))):
             tell(str(compared))
     source = source_of(options["encoder"], task)
     say(f"encoder: {source}; all evaluations: {out / EVALUATIONS}")

@@ -85,6 +85,11 @@ def is_batched(task: Task) -> bool:
     return hasattr(creator(spec_of(task), vector=True), "restore")
 
 
+def is_one_robot(task: Task, threads: int | None) -> bool:
+    """Whether only one instance of the environment may be made, as of a robot that exists once."""
+    return threads == 1 and not is_batched(task)
+
+
 def creator(spec: EnvSpec, vector: bool = False) -> Any:
     """The class or function that makes the environment; None if there is none."""
     entry_point = spec.vector_entry_point if vector else spec.entry_point

@@ -4,6 +4,7 @@ import json
 import shlex
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import chain
 from typing import Any
 
@@ -11,6 +12,7 @@ from jbrep.encoders import FULL
 from jbrep.encoders.base import OWN
 from jbrep.encoders.shipped import UNLEARNED, find, names
 from jbrep.envs.names import modules_of
+from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.report.tables import Tables
 from jbrep.report.words import shown_number
@@ -276,8 +278,10 @@ def _encoder_of(record: RunsRecord, label: str) -> str:
     shared = record.labels[label]
     task, name = shared.settings.environment, shared.encoder.name
     used = {run.encoder for run in record.runs if run.label == label}
-    ships = find(name, task).fingerprint if name in (*names(task), *UNLEARNED) else ""
-    return shared.settings.encoder_code or (name if used == {ships} else _KEPT)
+    with suppress(InputError):  # where what ships is of other features
+        if name in (*names(task), *UNLEARNED) and used == {find(name, task).fingerprint}:
+            return name
+    return shared.settings.encoder_code or _KEPT
 
 
 def _imports(record: RunsRecord, study: Study) -> str:

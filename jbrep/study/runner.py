@@ -126,7 +126,7 @@ def run_study(
     """
     check(plan)
     workers, unfinished = workers or usual_workers(plan), plan.unfinished
-    packs = packed(plan, workers, width)
+    packed(plan, workers, width)  # so that too little memory shows before anything is written
     make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
         plan.write()

@@ -108,8 +108,8 @@ def _own_leaves(schema: pa.Schema) -> Iterator[Leaf]:
             if size is not None:
                 place, short = i, names[i] if names else f"{each.name}_{i}"
                 name = f"{each.name}.{names[i] if names else i}"
-            leaf = Leaf(name, short, each.name, place, said.get(UNIT, ""))
-            yield leaf._replace(subtracted=offset)
+            unit = said.get(UNIT, "")
+            yield Leaf(name, short, each.name, place, unit, subtracted=offset)
 
 
 def with_widths(schema: pa.Schema, first: pa.RecordBatch | None) -> pa.Schema:
