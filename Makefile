@@ -149,7 +149,7 @@ worth: $(filter worth-%,$(STUDIES)) ## how well they do: seven hours; goes on wh
 	$(BIN)/python tools/worth.py $(addprefix results/,$^)
 $(SCORED): scored-%: $(READY)
 	test -e runs/$*/registration.json || $(BIN)/jbrep study studies/$*.toml --register --out runs/$*
-	$(BIN)/jbrep evaluate --encoder $$(ls runs/$*/encoders/*/*.safetensors) --data runs/$*/data/* --worth fitted planning --out results/$*/scores
+	$(BIN)/jbrep evaluate --encoder $$(ls runs/$*/encoders/*/*.safetensors) --data runs/$*/data/* --out results/$*/scores
 
 trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; goes on where it was stopped
 	for study in $(basename $(notdir $(wildcard studies/trainers/*.toml))); do \

@@ -240,7 +240,7 @@ def evaluate(
     *,
     policy: str | None = None,
     truth: "Dataset | str | Path | None" = None,
-    worth: Sequence[str] = (),
+    agents: bool = False,
 ) -> Judged:
     """Judge encoders on the held-out part of a data set, as `jbrep evaluate` does.
 
@@ -251,25 +251,23 @@ def evaluate(
         out: a folder for evaluation.json; None to write nothing.
         policy: that does the task well; None for the task's hand-written one, if there is one.
         truth: the data set that `data` was derived from, with what it hides.
-        worth: ways of finding out what codes are worth: agent, fitted, planning; see docs/worth.md.
+        agents: whether to find out what small agents return that observe each; see docs/worth.md.
 
     Raises:
         InputError: an encoder that isn't one of this task's, or two of one name; or the truth is of
-            another motion.
+            another motion; or as `jbrep.worth.check`.
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
     from jbrep.records.storage import check_writable
-    from jbrep.worth import check_ways
 
-    check_ways(worth)
-    if worth and out is None:
-        raise InputError("what codes are worth takes runs, which are kept: give out, a folder")
+    if agents and out is None:
+        raise InputError("agents' runs are kept: give out, a folder")
     scaled = ScaledDataset.of(data)
-    if worth:
-        from jbrep.worth.worth import check
+    if agents:
+        from jbrep.worth import check
 
-        check(scaled.dataset, worth)
+        check(scaled.dataset)
     if out is not None:
         check_writable(Path(out))
     from jbrep.evaluate.diagnosis import diagnose, write  # imports torch
@@ -281,12 +279,12 @@ def evaluate(
     whole = Dataset(truth) if isinstance(truth, str | Path) else truth
     if out is None:
         return Judged(diagnose(found, scaled, good, whole))
-    if not worth:
-        return Judged(write(found, scaled, Path(out), good, whole))
-    from jbrep.worth.worth import work_out
-
     evaluation = write(found, scaled, Path(out), good, whole)
-    return Judged(work_out(evaluation, found, scaled.dataset, Path(out), worth))
+    if not agents:
+        return Judged(evaluation)
+    from jbrep.worth import add_worth
+
+    return Judged(add_worth(evaluation, found, scaled.task, Path(out)))
 
 
 def train(

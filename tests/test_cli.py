@@ -364,7 +364,6 @@ given = (
     "train-encoder --kind fly --data nothing --out x",
     "collect --task fly --steps 10 --out x", "collect --task face_direction --steps -5 --out x",
     "evaluate --encoder dae-8 --data nothing",
-    "evaluate --encoder dae-8 --data nothing --worth gold",
     "evaluate-policy nothing", "inspect nothing",
     "behaviour nothing --out x", "study nothing.toml", "report nothing", "encoder info nothing",
     "behaviour heuristic --task face_direction --target-yaw nan --out x",

@@ -169,6 +169,8 @@ def test_the_split_is_by_episode_and_seeded(dataset):
     assert not set(episode[train]) & set(episode[test])
     np.testing.assert_array_equal(np.union1d(train, test), np.arange(5000))
     np.testing.assert_array_equal(test, dataset.split().test)
+    for rows, numbers in zip((train, test), dataset.split_episodes(), strict=True):
+        np.testing.assert_array_equal(np.unique(episode[rows]), numbers)
     assert len({tuple(np.unique(episode[dataset.split(seed=s).test])) for s in range(20)}) > 1
     assert len(np.unique(episode[dataset.split(test=0.99).test])) == 4
     for share in (0, 1, -0.2):

@@ -10,9 +10,9 @@ import gymnasium
 import pytest
 from command import in_this_process, jbrep
 
+from jbrep import worth
 from jbrep.evaluate import regression
 from jbrep.study.runner import BACKENDS
-from jbrep.worth import agents
 
 ROOT = Path(__file__).parent.parent
 LESS = {  # by command: numbers in place of a page's, or beside them
@@ -90,9 +90,9 @@ def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
 
 @pytest.mark.filterwarnings("ignore")  # of very short runs
 def test_ten_minutes_lead_from_a_robot_to_a_code(tmp_path, monkeypatch):
-    for where, less in ((agents, "STEPS"), (regression, "_STEPS")):
+    for where, less in ((worth, "STEPS"), (regression, "_STEPS")):
         monkeypatch.setattr(where, less, 100)
-    monkeypatch.setattr(agents, "RUNS", 1)
+    monkeypatch.setattr(worth, "RUNS", 1)
     monkeypatch.chdir(tmp_path)
     told = [jbrep(*words) for words in map(lessened, commands("docs/worth.md")[:6])]
     assert [each.exit_code for each in told] == [0] * 6, told

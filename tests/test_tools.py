@@ -105,7 +105,7 @@ def test_what_can_be_attacked_is_told(given, code, line, capsys, monkeypatch):
     assert "".join(capsys.readouterr()).startswith(line)
 
 
-def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatch):
+def test_scores_are_held_against_returns_of_the_same_encoders(tmp_path, capsys, monkeypatch):
     import worth
 
     finals = {
@@ -157,19 +157,17 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         data=SimpleNamespace(task=FACE),
         encoders={code: {"rewarded": -finals[code]} for code in codes},
         hashes={code: f"hash of {code}" for code in codes},
-        worth=SimpleNamespace(
-            learned={
-                "trees": {
-                    code: SimpleNamespace(final=SimpleNamespace(value=finals[code] ** 2))
-                    for code in codes
-                }
-            }
-        ),
     )
+    rows = [f"{code},hash of {code},trees,{finals[code] ** 2}" for code in codes]
+    (tmp_path / "scores").mkdir()
+    learned = tmp_path / "scores/learned.csv"
+    learned.write_text("\n".join(("code,sha256,way,final", *rows)))
+    monkeypatch.setattr(worth, "good_codes", lambda known: ["slow-8", "dae-8"])
+    monkeypatch.setattr(worth, "lacking", lambda known: {"slow-8": ["yaw"], "dae-8": []})
     monkeypatch.setattr(worth, "read_tables", lambda folder: tables)
     monkeypatch.setattr(worth, "read_document", lambda path, kind: evaluation)
     monkeypatch.setattr(worth, "headline", lambda known: known)
-    worth.main("study")
+    worth.main(tmp_path)
     lines = [re.split(" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
     assert lines[2] == ["ranked by", FACE, "mean", "above rewarded", "above a short run"]
     told = {name: [cell.split()[0] for cell in cells] for name, *cells in lines[3:7]}
@@ -180,20 +178,33 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         "a whole run": ["1.00", "1.00", "2.00", "2.00"],
     }
     assert lines[8][0].endswith("and clearly above both others: it is so")
-    assert lines[12] == ["code", "rewarded", "trees", "a short run", "a whole run", "final return"]
-    assert lines[13] == ["slow-8", "-40", "1,600", "-40", "40", "40"]
-    assert [line[0] for line in lines[13:]] == ["slow-8", "dae-8", "pca-8", "vae-8", "ofe-64"]
+    assert lines[12] == ["task", "0 to 0.05", "0.05 to 0.1", "0.1 to 0.2", "0.2 or more"]
+    assert lines[13][1:] == ["0 of 0"] * 3 + ["0 of 10"]
+    assert lines[17][1:] == ["should serve", "and lack nothing", "the others", "best of all"]
+    assert lines[18] == [FACE, "2: 35", "1: 30", "3: 13", "slow-8 40"]
+    assert lines[22] == ["code", "rewarded", "trees", "a short run", "a whole run", "final return"]
+    assert lines[23] == ["slow-8", "-40", "1,600", "-40", "40", "40"]
+    assert [line[0] for line in lines[23:]] == ["slow-8", "dae-8", "pca-8", "vae-8", "ofe-64"]
+    for code, value in zip(codes, (0.5, 0.52, 0.58, 0.8, 0.1), strict=True):
+        evaluation.encoders[code]["rewarded"] = value
+    worth.main(tmp_path)
+    lines = [re.split(" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
+    assert lines[13][1:] == ["1 of 1", "2 of 2", "0 of 0", "7 of 7"]
     returns[:] = [r for r in returns if (r.representation, r.seed, r.step) != ("dae-8", 0, 60_000)]
-    worth.main("study")  # of a run that failed before: it counts as -1, above -10 to -40 and -9
+    worth.main(tmp_path)  # of a run that failed before: it counts as -1, above -10 to -40 and -9
     lines = capsys.readouterr().out.splitlines()
     assert float(lines[5].split()[3]) > -1
     tables.record.missing = {"a run": 7}
     with pytest.raises(InputError, match="a study lacks runs of one task: run the study to its en"):
-        worth.main("study")
+        worth.main(tmp_path)
     tables.record.missing = {}
     evaluation.hashes["dae-8"] = "of another"
     with pytest.raises(InputError, match="dae-8: agents trained on another code than the one sco"):
-        worth.main("study")
+        worth.main(tmp_path)
+    evaluation.hashes["dae-8"] = "hash of dae-8"
+    learned.write_text("code,sha256,way,final\ndae-8,of another,trees,7")
+    with pytest.raises(InputError, match="dae-8 is another code than the one judged"):
+        worth.main(tmp_path)
 
 
 def test_hard_starts_are_those_where_episodes_fail(capsys):

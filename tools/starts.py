@@ -26,7 +26,6 @@ from jbrep.stats.scale import best_blind
 from jbrep.study.tables import references_of
 from jbrep.text import table
 from jbrep.training.trainer import single_torch_thread
-from jbrep.worth.offline import bounds_of
 
 BASELINE = "coordinates"
 
@@ -104,7 +103,8 @@ def main() -> None:
     given = parser.parse_args()
     runs = {folder: read_run(folder) for folder in runs_below(given.study)}
     known = play(runs, given.out, given.starts)
-    bounds = bounds_of(next(iter(runs.values())).settings.environment)
+    task = next(iter(runs.values())).settings.environment
+    bounds = Bounds.of(task.return_floor, task.return_ceiling)
     print(table(("agents on", "final return", f"of {BASELINE}'s gain"), cells(known, bounds)))
 
 

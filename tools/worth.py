@@ -1,19 +1,23 @@
 """How well scores rank codes: python tools/worth.py results/worth-TASK ...
 
 Each folder has the tables of a study of one task and, in scores/, the evaluation of its encoders
-with --worth. A code's score is compared with the mean final return of all its runs but one, for
-each that can be left out. The one that is left out is the rival: what a single short run would have
-said, which takes as long as to score a code one way, half a minute of CPU time. Whole runs show the
-most that one of them can say.
+from before the first run, and what ways of learning made of the stored data, which did so badly
+that jbrep has them no more. A code's score is compared with the mean final return of all its runs
+but one, for each that can be left out. The one that is left out is the rival: what a single short
+run would have said, which takes as long as to score a code one way, half a minute of CPU time.
+Whole runs show the most that one of them can say.
 
 Printed is Spearman's correlation in each task, and its mean over tasks with a 95 % interval over
 families of codes, and by how much that is above *rewarded* and above the short run. What was hoped
-for was written down before the first run: see PRIMARY. Then, for each task, what was said of every
-code and what its agents returned.
+for was written down before the first run: see PRIMARY. Then how often, of two codes, the one with
+more *rewarded* returned more; what the codes returned that `jbrep evaluate` said should serve; and,
+for each task, what was said of every code and what its agents returned.
 """
 
+import csv
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,16 +28,18 @@ from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.table import headline
 from jbrep.records.document import read_document
+from jbrep.report.serving import good_codes, lacking
 from jbrep.report.tables import Tables, read_tables
 from jbrep.stats.association import difference, mean_rank_correlation
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.study.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, interval, number
 
-SCORES = "scores"
+SCORES, LEARNED = "scores", "learned.csv"
 REWARDED, SHORT, WHOLE = "rewarded", "a short run", "a whole run"
 SHORT_STEPS = 50_000  # until the first evaluation after them: half a minute
 PRIMARY, LEAST, LEAST_LOW = "trees", 0.8, 0.6  # the mean over tasks, and its interval's low end
+APART = 0, 0.05, 0.1, 0.2  # differences in *rewarded*, from each to the next
 Pairs = list[tuple[Array, Array]]  # what is said of each code, and what others' runs returned
 
 
@@ -45,12 +51,18 @@ class Scored(NamedTuple):
         codes: n of them.
         families: of the codes, (n,).
         pairs: for each run that is left out, by what ranks the codes.
+        returns: the mean final return of each code, (n,).
+        good: the codes that should serve, by their evaluation.
+        whole: those of them that lack nothing that a controller needs.
     """
 
     task: str
     codes: list[str]
     families: list[str]
     pairs: Mapping[str, Pairs]
+    returns: Array
+    good: list[str]
+    whole: list[str]
 
 
 def read(folder: Path) -> Scored:
@@ -71,19 +83,38 @@ def read(folder: Path) -> Scored:
     others = (finals.sum(1, keepdims=True) - finals) / (finals.shape[1] - 1)
     pairs: dict[str, Pairs] = {
         name: [(np.array([score[code] for code in codes]), each) for each in others.T]
-        for name, score in scores(evaluation).items()
+        for name, score in scores(evaluation, folder / SCORES / LEARNED).items()
     }
     for name, single in ((SHORT, short), (WHOLE, whole)):
         pairs[name] = [*zip(single.T, others.T, strict=True)]
-    return Scored(evaluation.data.task, codes, [kinds[code] for code in codes], pairs)
+    good, lacks = good_codes(evaluation), lacking(evaluation)
+    return Scored(
+        task=evaluation.data.task,
+        codes=codes,
+        families=[kinds[code] for code in codes],
+        pairs=pairs,
+        returns=finals.mean(1),
+        good=good,
+        whole=[code for code in good if not lacks[code]],
+    )
 
 
-def scores(evaluation: Evaluation) -> dict[str, Mapping[str, float]]:
-    """What was known of every code before agents trained, by what found it out."""
-    known = {code: headline(each)[REWARDED] or 0.0 for code, each in evaluation.encoders.items()}
-    ways = evaluation.worth.learned if evaluation.worth else {}
-    found = {way: {c: each.final.value or 0.0 for c, each in ways[way].items()} for way in ways}
-    return {REWARDED: known, **{w: each for w, each in found.items() if each.keys() >= {*known}}}
+def scores(evaluation: Evaluation, path: Path) -> dict[str, dict[str, float]]:
+    """What was known of every code before agents trained, by what found it out.
+
+    Raises:
+        InputError: something was learned from other encoders than those that were judged.
+    """
+    found = {
+        REWARDED: {code: headline(e)[REWARDED] or 0.0 for code, e in evaluation.encoders.items()}
+    }
+    if path.exists():
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                if row["sha256"] != evaluation.hashes.get(row["code"], ""):
+                    raise InputError(f"{path}: {row['code']} is another code than the one judged")
+                found.setdefault(row["way"], {})[row["code"]] = float(row["final"])
+    return found
 
 
 def returned(tables: Tables, codes: Sequence[str]) -> tuple[Array, Array, Array]:
@@ -128,14 +159,51 @@ def check(evaluation: Evaluation, tables: Tables) -> None:
             raise InputError(f"{run.label}: agents trained on another code than the one scored")
 
 
+def apart(task: Scored) -> Iterator[str]:
+    """How often, of two codes so far apart in *rewarded*, the one with more returned more."""
+    said, _ = task.pairs[REWARDED][0]
+    pairs = np.array([*combinations(range(len(task.codes)), 2)]).T
+    more, returned = (values[pairs[0]] - values[pairs[1]] for values in (said, task.returns))
+    for least, most in pairwise((*APART, np.inf)):
+        within = (np.abs(more) >= least) & (np.abs(more) < most)
+        agree = (more * returned > 0) & within
+        yield f"{agree.sum()} of {within.sum()}"
+
+
+def advised(task: Scored) -> tuple[str, ...]:
+    """What codes returned that should serve, and those of them that lack nothing; and others."""
+    returns = dict(zip(task.codes, task.returns, strict=True))
+    others = [code for code in task.codes if code not in task.good]
+    groups = task.good, task.whole, others
+    told = (
+        f"{len(codes)}: {np.mean([returns[code] for code in codes]):.0f}" if codes else "none"
+        for codes in groups
+    )
+    best = max(returns, key=returns.__getitem__)
+    return task.task, *told, f"{best} {returns[best]:.0f}"
+
+
 def by_code(task: Scored) -> Table:
     """What was said of every code, beside the mean final return of its runs, the best first."""
     said = {name: np.mean([each for each, _ in pairs], 0) for name, pairs in task.pairs.items()}
-    said["final return"] = np.mean([others for _, others in task.pairs[WHOLE]], 0)
+    said["final return"] = task.returns
     cells = {name: [number(each, SIGNIFICANT) for each in values] for name, values in said.items()}
     order = np.argsort(-said["final return"], kind="stable")
     rows = [(task.codes[i], *(of_codes[i] for of_codes in cells.values())) for i in order]
     return Table(f"{task.task}: scores and mean returns", ("code", *cells), rows)
+
+
+def verdict(mean: Interval, above_rewarded: Interval, above_short: Interval) -> str:
+    """Whether what was hoped for is so."""
+    holds = (
+        mean.value >= LEAST
+        and mean.low > LEAST_LOW
+        and min(above_rewarded.low, above_short.low) > 0
+    )
+    return (
+        f"Hoped for: by {PRIMARY} at least {LEAST} on average, above {LEAST_LOW} at the low end, "
+        f"and clearly above both others: {'it is so' if holds else 'it is not so'}"
+    )
 
 
 def main(*folders: str) -> None:
@@ -162,16 +230,15 @@ def main(*folders: str) -> None:
     counts = f"{len(first.codes)} codes of {len({*first.families})} families"
     title = f"Rank correlations with mean final returns, {counts}"
     print(Table(title, (*header, f"above {SHORT}"), rows).text())
-    *_, mean, above_rewarded, above_short = found[PRIMARY]
-    holds = (
-        mean.value >= LEAST
-        and mean.low > LEAST_LOW
-        and min(above_rewarded.low, above_short.low) > 0
-    )
-    print(
-        f"\nHoped for: by {PRIMARY} at least {LEAST} on average, above {LEAST_LOW} at the low end, "
-        f"and clearly above both others: {'it is so' if holds else 'it is not so'}"
-    )
+    if PRIMARY in found:
+        print(f"\n{verdict(*found[PRIMARY][-3:])}")
+    differences = [f"{least:g} to {most:g}" for least, most in pairwise(APART)]
+    differences.append(f"{APART[-1]:g} or more")
+    title = f"Of two codes, how often that with more {REWARDED} returned more, by their difference"
+    print(f"\n{Table(title, ('task', *differences), [(e.task, *apart(e)) for e in tasks]).text()}")
+    title = "How many codes should serve by jbrep evaluate, and their mean final return"
+    header = ("task", "should serve", "and lack nothing", "the others", "best of all")
+    print(f"\n{Table(title, header, [advised(each) for each in tasks]).text()}")
     for each in tasks:
         print(f"\n{by_code(each).text()}")
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 _LETTERS = 100  # of the name of a folder
-_KEPT = "the same command keeps what is known of each code's worth, and resumes agents"
+_KEPT = "the same command resumes agents"
 
 
 @click.command(
@@ -56,11 +56,10 @@ _KEPT = "the same command keeps what is known of each code's worth, and resumes 
     "isn't seen.",
 )
 @click.option(
-    "--worth",
-    multiple=True,
-    help="What each code is worth, and which one to take: agent trains two small agents on it, two "
-    "or three minutes of a core; fitted and planning learn from the data alone, at most half a "
-    "minute each way, and say less.",
+    "--agents",
+    is_flag=True,
+    help="Train two small agents on each code and on the full observation, two or three minutes of "
+    "a core for each code, and show which code to take.",
 )
 @click.option(
     "--all",
@@ -75,7 +74,7 @@ def evaluate(
     out: Path | None,
     policy: str | None,
     truth: Path | None,
-    worth: tuple[str, ...],
+    agents: bool,
     everything: bool,
     as_json: bool,
 ) -> None:
@@ -86,9 +85,6 @@ def evaluate(
     the latent's units and dimensions, nearest neighbours, and the prediction of the next latent. An
     encoder of your own is code such as mymodule:MyEncoder; its module is imported, which runs it.
     """
-    from jbrep.worth import check_ways
-
-    check_ways(worth)
     from jbrep import api
     from jbrep.dataset import Dataset
     from jbrep.encoders.shipped import check_found, find_all, source_of
@@ -108,9 +104,9 @@ def evaluate(
         label: source_of(name, whole.task) for label, name in zip(encoders, encoder, strict=True)
     }
     out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(encoders))[:_LETTERS])
-    with stoppable(_KEPT if worth else "the same command starts over"):
+    with stoppable(_KEPT if agents else "the same command starts over"):
         evaluation = api.evaluate(
-            encoders, whole, out, policy=policy, truth=truth, worth=worth
+            encoders, whole, out, policy=policy, truth=truth, agents=agents
         ).evaluation
         pictures = write_plots(encoder_plots(evaluation), out)
     width = terminal_width()
@@ -120,10 +116,12 @@ def evaluate(
         return echo_json(evaluation.as_json())
     click.echo(evaluation_text(evaluation, width, everything) + "\n")
     click.echo("\n".join(notes))
-    more = "" if everything else " --all shows errors, probes and units."
+    has_agents = evaluation.worth is not None
+    more = {"--all shows more": everything, "--agents trains small agents on each": has_agents}
+    hints = ", ".join(hint for hint, is_done in more.items() if not is_done)
     click.echo()
     say(str(out / EVALUATION))
-    return click.echo(f"Beside it: {len(pictures)} figures.{more}")
+    return click.echo(f"Beside it: {len(pictures)} figures." + (f" {hints}." if hints else ""))
 
 
 def _notes(

@@ -161,31 +161,15 @@ class Diagnostics(Record, frozen=True, kw_only=True):
     sha256: str | None = None  # of the encoder; None of the full observation
 
 
-class Learned(Record, frozen=True, kw_only=True):
-    """What a way of learning made of a code."""
-
-    score: Score  # the mean return of an episode
-    again: Score | None = None  # learned again with steps of its own beside those of the data
-    seconds: float  # of CPU time
-
-    @property
-    def final(self) -> Score:
-        """The mean return that counts: with steps of its own, if there were any."""
-        return self.again or self.score
-
-
 class Worth(Record, frozen=True, kw_only=True):
-    """What codes are worth to ways of learning, as far as is known; see docs/worth.md."""
+    """What small agents return that observe the codes, as far as is known; see docs/worth.md."""
 
-    estimated: bool  # whether returns are estimated from data, not played
-    episodes: int  # in which each is played
-    runs: int = 0  # of agents, of each code
-    steps: int = 0  # that these learned for
-    agent_seconds: float = 0.0  # of CPU time that all agents took so far
-    learned: dict[str, dict[str, Learned]] = {}  # by way of learning, by label
-    references: dict[str, float] = {}  # mean returns of policies that don't learn
-    rewards: tuple[float, float] | None = None  # that was learned from: mean, standard deviation
-    ends: bool = False  # whether a state ended an episode in what was learned from
+    runs: int  # of each code
+    steps: int  # that each run learns for
+    episodes: int  # of each run's last evaluation
+    seconds: float = 0.0  # of CPU time that all agents took so far
+    returns: dict[str, Score] = {}  # mean returns by label
+    references: dict[str, float]  # mean returns of policies that don't learn
 
 
 class JudgedOn(Record, frozen=True, kw_only=True):

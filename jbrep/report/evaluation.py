@@ -8,7 +8,7 @@ from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Scores, Worth
 from jbrep.evaluate.table import headline
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.report.serving import lacking, serving, unreadable, untold
-from jbrep.report.worth import Ranked, advice, conditioning, ranked, worth_table
+from jbrep.report.worth import advice, conditioning, ranked
 from jbrep.report.worth import title as worth_title
 from jbrep.text import SIGNIFICANT, Table, counted, facts, html, interval, number, r2_text, wrapped
 
@@ -59,14 +59,10 @@ def evaluation_html(evaluation: Evaluation) -> str:
 
 def _parts(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
     """What tells codes that serve from others; first what they are worth, if that is known."""
-    worth = evaluation.worth
-    found = ranked(worth)
     tables = _headline(evaluation), *_unseen(evaluation)
-    if worth:
-        yield wrapped(advice(evaluation, worth), width)
-    if worth and found:
-        yield _worths(evaluation, worth, found, width)
-        yield from (worth_table(worth), *tables) if len(worth.learned) > 1 else tables
+    if evaluation.worth and evaluation.worth.returns:
+        yield _worths(evaluation, evaluation.worth, width)
+        yield from tables
     else:
         yield wrapped(serving(evaluation), width)
         yield from tables
@@ -122,19 +118,21 @@ def _columns(evaluation: Evaluation, width: int | None) -> str:
     return facts(named, width or sys.maxsize, indent=0)
 
 
-def _worths(evaluation: Evaluation, worth: Worth, found: Ranked, width: int | None) -> str:
-    """A line for each code, the best first: its mean return, and why it isn't more."""
+def _worths(evaluation: Evaluation, worth: Worth, width: int | None) -> str:
+    """Which code to take, and a line for each: its mean return, and why it isn't more."""
+    found = ranked(worth)
     lacks = {} if untold(evaluation) else _lacks(evaluation)
-    lines, learned = {}, worth.learned[found.way]
+    lines = {}
     for label in found.means:
         why = [f"lacks {lacks[label]}"] if lacks.get(label) else []
         if label not in found.best:
-            why += filter(None, [conditioning(evaluation, worth, label)])
+            why += filter(None, [conditioning(evaluation.encoders[label].latent_units)])
             why = why or ["why isn't known"]
-        lines[label] = "; ".join((interval(learned[label].final, SIGNIFICANT), *why))
-    title = worth_title(worth, found) + (f". {_LACKING}" if lacks else "")
+        lines[label] = "; ".join((interval(worth.returns[label], SIGNIFICANT), *why))
+    title = worth_title(worth) + (f". {_LACKING}" if lacks else "")
     told = facts(lines, width or sys.maxsize, indent=0)
-    return "\n".join((wrapped(title, width), told, *_unsaid(evaluation, width)))
+    advised = wrapped(advice(evaluation, found), width) + "\n"
+    return "\n".join((advised, wrapped(title, width), told, *_unsaid(evaluation, width)))
 
 
 def _lacking(evaluation: Evaluation, width: int | None) -> str:

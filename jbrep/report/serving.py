@@ -25,6 +25,17 @@ class _Measured(NamedTuple):
     r2: Mapping[str, float]  # of codes, the best first
     full: float
 
+    @property
+    def good(self) -> list[str]:
+        """The codes that tell about as much as the full observation."""
+        return [label for label, r2 in self.r2.items() if r2 >= _AS_GOOD * self.full]
+
+
+def good_codes(evaluation: Evaluation) -> list[str]:
+    """The codes that should serve a controller, the best first."""
+    measured = _measured(evaluation)
+    return measured.good if measured else []
+
 
 def serving(evaluation: Evaluation) -> str:
     """Which codes serve, or which comes nearest, or why that can't be said."""
@@ -37,7 +48,7 @@ def serving(evaluation: Evaluation) -> str:
         )
     if not measured.r2:
         return f"The full observation alone: R² {r2_text(measured.full)} of {measured.what}."
-    good = [label for label, r2 in measured.r2.items() if r2 >= _AS_GOOD * measured.full]
+    good = measured.good
     if not good:
         nearest, r2 = next(iter(measured.r2.items()))
         return (

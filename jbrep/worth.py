@@ -1,0 +1,161 @@
+"""What codes are worth: what small agents return that observe them; see docs/worth.md."""
+
+import time
+import warnings
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jbrep.dataset import Dataset
+from jbrep.encoders import FULL, find
+from jbrep.encoders.base import BaseEncoder
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.task import Array, Task
+from jbrep.errors import InputError, Notice
+from jbrep.evaluate.evaluation import EVALUATION, Evaluation, Score, Worth, score
+from jbrep.machine import cores
+from jbrep.progress import Progress
+from jbrep.records.lock import exclusive
+from jbrep.rl.files import FAILED, RunRecord, last_returns, read_evaluations
+from jbrep.rl.job import Job, Session
+from jbrep.rl.run import Run
+from jbrep.rl.trainers import train_jobs
+from jbrep.stats.intervals import LEVEL, Bounds, mean_within
+from jbrep.study.tables import references_of
+from jbrep.text import slug
+
+_ALGORITHM = "sac"
+STEPS, RUNS = 100_000, 2  # of a run, of a code
+EPISODES = 20  # of the last evaluation of each agent
+_MOST_LETTERS = 100  # of what a run calls its representation
+
+
+def check(data: Dataset) -> None:
+    """Check, before anything else takes time, that agents can learn what the data are of.
+
+    Raises:
+        InputError: the environment can't be made, or it gives other rewards.
+    """
+    reason = "gives other rewards" if data.manifest.settings.reward else ""
+    try:
+        with closing(Lanes(data.task, 1)):
+            pass
+    except (InputError, ModuleNotFoundError):
+        reason = "can't be made here"
+    if reason:
+        raise InputError(
+            f"the environment of {data.folder} {reason}: no agent can be trained; without --agents "
+            "codes are judged by the data alone"
+        )
+
+
+def add_worth(
+    evaluation: Evaluation, encoders: Mapping[str, BaseEncoder], task: Task, folder: Path
+) -> Evaluation:
+    """Train small agents on codes, and add what these return to an evaluation and its file.
+
+    What the evaluation has already stays.
+
+    Args:
+        evaluation: of the encoders.
+        encoders: by label; the full observation is compared with them.
+        task: that is learned.
+        folder: of the evaluation; the runs are kept there, and go on if they were stopped.
+
+    Raises:
+        InputError: the folder holds other runs; a run failed before there was a return; or as
+            `Run.settings`.
+    """
+    path = folder / EVALUATION
+    with exclusive(path, beside=True):
+        worth = evaluation.worth or _begun(task)
+        if worth.returns:
+            return evaluation
+        began = time.process_time()
+        try:
+            every = {FULL: find(FULL, task), **encoders}
+            worth = worth.replace(returns=learned(every, task, folder / "agents"))
+        finally:  # the time of agents that were stopped counts
+            worth = worth.replace(seconds=worth.seconds + time.process_time() - began)
+            evaluation = evaluation.replace(worth=worth)
+            evaluation.write(path)
+    return evaluation
+
+
+def _begun(task: Task) -> Worth:
+    """What is known before agents have learned: what policies return that don't."""
+    played = references_of(task, EPISODES)
+    means = {policy: float(returns.mean()) for policy, returns in played.items()}
+    return Worth(runs=RUNS, steps=STEPS, episodes=EPISODES, references=means)
+
+
+def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, Score]:
+    """What agents of the usual preset return in the end, by the code that they observe.
+
+    All learn together. Stopped or killed, the same call resumes them.
+
+    Args:
+        encoders: by label, as a run takes them.
+        task: that is learned.
+        folder: for the runs.
+
+    Raises:
+        InputError: as `add_worth`.
+    """
+    jobs = {
+        (label, seed): _job(task, label, encoder, seed, folder)
+        for label, encoder in encoders.items()
+        for seed in range(RUNS)
+    }
+    done = {job.folder: 0 for job in jobs.values()}  # a job is made anew where another's fails
+    with Progress(total=STEPS * len(jobs), unit="step", unit_scale=True, desc="agents") as bar:
+
+        def watch(job: Job, step: int) -> None:
+            bar.update(min(step, STEPS) - done[job.folder])
+            done[job.folder] = min(step, STEPS)
+
+        trained = train_jobs([*jobs.values()], Session(watch))
+        ended = {job.folder: record for job, record in trained}
+    bounds = Bounds.of(task.return_floor, task.return_ceiling)
+    found = {}
+    for label in encoders:
+        own = [jobs[label, seed] for seed in range(RUNS)]
+        returns = np.concatenate([_returns(job, ended[job.folder], bounds.low) for job in own])
+        found[label] = score(mean_within(returns, bounds, LEVEL))
+    return found
+
+
+def _job(task: Task, label: str, encoder: Any, seed: int, folder: Path) -> Job:
+    """A run on a code, by its label."""
+    name = slug(label)[-_MOST_LETTERS:]
+    run = Run.of(
+        task,
+        _ALGORITHM,
+        encoder=encoder,
+        representation=name,
+        seed=seed,
+        steps=STEPS,
+        evaluate_every=STEPS,
+        final_episodes=EPISODES,
+    )
+    return Job(run, folder / name / f"seed-{seed}", cores())
+
+
+def _returns(job: Job, record: RunRecord, least: float) -> Array:
+    """The last returns of an agent; of one that failed the least possible, or its worst.
+
+    Raises:
+        InputError: it failed before its first evaluation, and no return is the least possible.
+    """
+    evaluations = read_evaluations(job.folder)
+    if record.status != FAILED:
+        return np.array(last_returns(evaluations))
+    warnings.warn(f"{job.settings.name} failed: {record.reason}", Notice, stacklevel=2)
+    if not np.isfinite(least):
+        if not evaluations:
+            raise InputError(f"{job.settings.name} has no return to count: {record.reason}")
+        least = min(each.episode_return for each in evaluations)
+    return np.full(EPISODES, least)
