@@ -333,12 +333,12 @@ def train(
     from jbrep.rl.trainers import train_jobs
 
     known = as_task(task)
-    is_one = is_one_robot(known, threads)
-    preset = preset or (MODERN if is_one else "")
+    if one_robot := is_one_robot(known, threads):
+        preset, settings = preset or MODERN, {**settings, "one_robot": True}
     run = Run.of(known, algorithm, preset, overrides, encoder=encoder, seed=seed, **settings)
-    if is_one and run.learner.hyperparameters.num_envs > 1:
+    if one_robot and run.learner.hyperparameters.num_envs > 1:
         run = run.replace(learner=run.learner.overridden({"num_envs": 1}))
-    job = Job(run, Path(out), threads or cores(), retries, is_one)
+    job = Job(run, Path(out), threads or cores(), retries)
     if ended := job.result:
         _note(f"the run in {job.folder} had {ended.status} already: nothing was done")
     elif not known.reproducible:

@@ -295,7 +295,9 @@ def test_one_robot_remembers_what_it_saw_before_an_evaluation(normalize, tmp_pat
     overrides = {"num_envs": 1, "learning_starts": 1000, "normalize": normalize}
     how = {"algorithm": "sac", "preset": "modern", "trainer": "sb3", "overrides": overrides}
     run = Run.of(CART, steps=100, evaluate_every=25, **how, **ONE_EACH)
-    [*_] = train_jobs([Job(run, tmp_path, 1, 0, True)], Session(keep_checkpoint=True))
+    [*_] = train_jobs(
+        [Job(run.replace(one_robot=True), tmp_path, 1)], Session(keep_checkpoint=True)
+    )
     assert len({row.step for row in read_evaluations(tmp_path)}) == 5
     tensors, _ = container.read(tmp_path / CHECKPOINT, "checkpoint")
     before, after, dones = (

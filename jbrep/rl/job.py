@@ -87,8 +87,6 @@ class Job:
         folder: where; it need not exist yet.
         threads: that may step its robots; gradient steps take one. None: one, or all beside a GPU.
         retries: how often in a row an environment that fails is made anew.
-        is_one_robot: whether training and evaluations have the same instance of the environment;
-            evaluations then wait for the end of an episode of training.
         encoder: that the run sees its task through.
         settings: of the run, as run.json has them.
         history: what was recorded so far.
@@ -103,17 +101,15 @@ class Job:
         folder: Path,
         threads: int | None = None,
         retries: int = 0,
-        is_one_robot: bool = False,
     ):
-        self.run, self.folder, self.threads = run, folder, threads
-        self.retries, self.is_one_robot = retries, is_one_robot
+        self.run, self.folder, self.threads, self.retries = run, folder, threads, retries
         self.encoder = run.find_encoder()
         self.settings = self._going_on(self._as_begun(run.settings(self.encoder)))
         self.history = History()
 
     def anew(self) -> "Job":
         """The same with nothing recorded yet."""
-        return Job(self.run, self.folder, self.threads, self.retries, self.is_one_robot)
+        return Job(self.run, self.folder, self.threads, self.retries)
 
     def threads_for(self, lanes: int) -> int:
         """How many threads step so many of its robots; no bit depends on it."""
@@ -225,7 +221,7 @@ class Job:
 
     def share(self, lanes: Lanes) -> None:
         """Evaluate in the lanes of training, if there is one robot."""
-        if self.is_one_robot:
+        if self.run.one_robot:
             self.evaluator = self._evaluator(lanes)
 
     def _evaluator(self, lanes: Lanes | None) -> Evaluator:
@@ -243,7 +239,7 @@ class Job:
             keep_checkpoint: as for `RunSettings.is_evaluation_due`.
         """
         every, last = self.settings.evaluate_every, self.history.evaluations[-1].step
-        if not self.is_one_robot:
+        if not self.run.one_robot:
             return self.settings.is_evaluation_due(step, keep_checkpoint)
         return episode_ended and step < self.settings.steps and step // every > last // every
 

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from msgspec import UNSET
+
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import as_file
@@ -51,6 +53,7 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
         encoder_seed: that the encoder was made with, if each run has its own.
         begin_from: the folder of a finished run, whose policy this one begins with.
         registration: SHA-256 of that of its study, if that is registered.
+        one_robot: whether there is one instance of the environment, as of a robot that exists once.
 
     Raises:
         InputError: a number out of range, or a name that can't be used.
@@ -64,6 +67,7 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
     encoder_seed: Seed | None = None
     begin_from: str = ""
     registration: Sha256 | None = None
+    one_robot: bool = False
 
     @classmethod
     def of(
@@ -133,6 +137,7 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
             seed=self.seed,
             begin_from=None,
             registration=self.registration,
+            one_robot=self.one_robot or UNSET,
             **shared,
         )
         if not self.begin_from:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from jbrep.envs.task import Id, Task, changed_parts
 from jbrep.errors import InputError, differences
@@ -65,6 +65,8 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
         encoder_seed: that the encoder was made with, if each run has its own.
         begin_from: SHA-256 of the policy of another run that this one begins with, if it does.
         registration: SHA-256 of that of its study, if that is registered.
+        one_robot: whether it was trained and evaluated in one instance of its environment;
+            evaluations then wait for the end of an episode of training.
     """
 
     seed: Seed
@@ -72,6 +74,7 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
     encoder_seed: Seed | None
     begin_from: Sha256 | None = msgspec.field(name="from")
     registration: Sha256 | None
+    one_robot: Literal[True] | UnsetType = UNSET
 
     @property
     def name(self) -> str:
@@ -126,5 +129,6 @@ def _flat(settings: RunSettings) -> dict[str, Any]:
     own = to_plain(settings)
     parts = own.pop("environment"), own.pop("hyperparameters")
     first = {name: own[name] for name in ("task", "algorithm", "representation")}
+    own["one_robot"] = settings.one_robot is True
     first["domain"] = parts[0]["domain"] = str(settings.environment.domain or "none")
     return {**first, **own, **parts[0], **parts[1]}

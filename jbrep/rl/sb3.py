@@ -154,7 +154,7 @@ class _Follower(BaseCallback):
             observed: its first observation as the agent is to see it, (1, l).
         """
         self._job.evaluate(self.model)
-        if self._job.is_one_robot:
+        if self._job.run.one_robot:
             first: Any = _env(self.model).restart()
             if normalizer := self.model.get_vec_normalize_env():
                 normalizer.old_obs = first

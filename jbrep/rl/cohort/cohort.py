@@ -215,7 +215,7 @@ class Cohort:
     def evaluate_amid(self) -> None:
         """Evaluate between steps of training, whose episodes go on or, of one robot, begin anew."""
         self.evaluate()
-        if self.members[0].job.is_one_robot:
+        if self.members[0].job.run.one_robot:
             self._observation = self._encode(self._robots.restart())
 
     def evaluate_if_due(self, keep_checkpoint: bool) -> None:
