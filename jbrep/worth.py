@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -95,7 +95,8 @@ def _begun(task: Task) -> Worth:
 def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, Score]:
     """What agents of the usual preset return in the end, by the code that they observe.
 
-    All learn together. Stopped or killed, the same call resumes them.
+    All learn together. Stopped or killed, the same call resumes them. One that fails counts as in
+    studies: with the least possible return, or the worst that any of them had.
 
     Args:
         encoders: by label, as a run takes them.
@@ -110,21 +111,49 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
         for label, encoder in encoders.items()
         for seed in range(RUNS)
     }
-    done = {job.folder: 0 for job in jobs.values()}  # a job is made anew where another's fails
+    returns = _returns([*jobs.values()], _trained([*jobs.values()]), task)
+    bounds = Bounds.of(task.return_floor, task.return_ceiling)
+    found = {}
+    for label in encoders:
+        own = [returns[jobs[label, seed].folder] for seed in range(RUNS)]
+        found[label] = score(mean_within(np.concatenate(own), bounds, LEVEL))
+    return found
+
+
+def _trained(jobs: Sequence[Job]) -> dict[Path, RunRecord]:
+    """What became of runs that learn together, by folder."""
+    done = {job.folder: 0 for job in jobs}  # a job is made anew where another's fails
     with Progress(total=STEPS * len(jobs), unit="step", unit_scale=True, desc="agents") as bar:
 
         def watch(job: Job, step: int) -> None:
             bar.update(min(step, STEPS) - done[job.folder])
             done[job.folder] = min(step, STEPS)
 
-        trained = train_jobs([*jobs.values()], Session(watch))
-        ended = {job.folder: record for job, record in trained}
-    bounds = Bounds.of(task.return_floor, task.return_ceiling)
+        return {job.folder: record for job, record in train_jobs(jobs, Session(watch))}
+
+
+def _returns(
+    jobs: Sequence[Job], records: Mapping[Path, RunRecord], task: Task
+) -> dict[Path, Array]:
+    """The last returns of each agent, (20,), by folder; see `learned` for those that failed.
+
+    Raises:
+        InputError: one failed, and there is no return to count.
+    """
+    evaluations = {job.folder: read_evaluations(job.folder) for job in jobs}
+    least = task.return_floor
+    if least is None:
+        seen = [each.episode_return for several in evaluations.values() for each in several]
+        least = min(seen, default=None)
     found = {}
-    for label in encoders:
-        own = [jobs[label, seed] for seed in range(RUNS)]
-        returns = np.concatenate([_returns(job, ended[job.folder], bounds.low) for job in own])
-        found[label] = score(mean_within(returns, bounds, LEVEL))
+    for job in jobs:
+        if (record := records[job.folder]).status != FAILED:
+            found[job.folder] = np.array(last_returns(evaluations[job.folder]))
+            continue
+        warnings.warn(f"{job.settings.name} failed: {record.reason}", Notice, stacklevel=2)
+        if least is None:
+            raise InputError(f"{job.settings.name} has no return to count: {record.reason}")
+        found[job.folder] = np.full(EPISODES, least)
     return found
 
 
@@ -142,20 +171,3 @@ def _job(task: Task, label: str, encoder: Any, seed: int, folder: Path) -> Job:
         final_episodes=EPISODES,
     )
     return Job(run, folder / name / f"seed-{seed}", cores())
-
-
-def _returns(job: Job, record: RunRecord, least: float) -> Array:
-    """The last returns of an agent; of one that failed the least possible, or its worst.
-
-    Raises:
-        InputError: it failed before its first evaluation, and no return is the least possible.
-    """
-    evaluations = read_evaluations(job.folder)
-    if record.status != FAILED:
-        return np.array(last_returns(evaluations))
-    warnings.warn(f"{job.settings.name} failed: {record.reason}", Notice, stacklevel=2)
-    if not np.isfinite(least):
-        if not evaluations:
-            raise InputError(f"{job.settings.name} has no return to count: {record.reason}")
-        least = min(each.episode_return for each in evaluations)
-    return np.full(EPISODES, least)

@@ -2,7 +2,6 @@
 
 import itertools
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from jbrep.dataset import Dataset
 from jbrep.encoders import find
 from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs.task import Task
 from jbrep.errors import InputError, Notice
 from jbrep.evaluate.evaluation import Evaluation, Lost, Score, Worth
 from jbrep.play.rollout import replay
@@ -23,8 +23,8 @@ from jbrep.records.document import read_document
 from jbrep.records.lock import exclusive
 from jbrep.report.evaluation import evaluation_text
 from jbrep.report.worth import condition
+from jbrep.rl.files import read_evaluations
 from jbrep.rl.trainers import train_jobs
-from jbrep.stats.intervals import Bounds
 from jbrep.worth import add_worth, learned
 
 
@@ -136,12 +136,16 @@ def test_an_agent_whose_environment_fails_ends_alone(data, tmp_path, monkeypatch
     with pytest.warns(Notice, match="/full/seed-0 failed: no power after 0 steps"):
         returns = learned(codes, data.task, tmp_path)
     assert returns["full"].value == 0 < returns["pca-8"].value
-    monkeypatch.setattr(worth, "Bounds", SimpleNamespace(of=lambda low, high: Bounds()))
+    monkeypatch.setattr(Task, "return_floor", None)
+    with pytest.warns(Notice, match="no power"):
+        returns = learned(codes, data.task, tmp_path)
+    seen = [each.episode_return for each in read_evaluations(tmp_path / "pca-8/seed-0")]
+    assert returns["full"].value == pytest.approx(min(seen))  # the worst that the other had
     with (
         pytest.warns(Notice, match="no power"),
         pytest.raises(InputError, match="/full/seed-0 has no return to count: no power"),
     ):
-        learned(codes, data.task, tmp_path)
+        learned({"full": codes["full"]}, data.task, tmp_path)
 
 
 def returns_of(told, full, pca):
