@@ -177,7 +177,7 @@ def test_an_evaluation_is_told_in_one_screen(evaluation):
     shown = evaluation_text(evaluation, 80)
     assert max(map(len, shown.splitlines())) <= 80
     assert len(shown.splitlines()) < 24
-    assert shown.startswith("without idle should serve a controller: it tells the change of what")
+    assert shown.startswith("Take without idle: it tells the change of what the reward depends on")
     assert re.search(r"without load +load \((<0|0\.\d\d)\)\nwithout idle +nothing", shown)
 
 
@@ -190,8 +190,21 @@ def test_the_smallest_code_without_a_loss_is_named_beside_a_smaller_one_with(eva
         "small": good.replace(latent=2, loses=evaluation.encoders["without load"].loses),
     }
     told = serving(evaluation.replace(encoders=codes))
-    smallest = "The smallest is small, and of those that lack nothing large."
-    assert told.endswith(f"{smallest} But see what small lacks.")
+    assert told.startswith("Take large: it tells the change")
+    assert "), and is the smallest that does and lacks nothing, of large and larger. small" in told
+    assert told.endswith(". small tells about as much, but lacks something.")
+    alone = serving(evaluation.replace(encoders={k: codes[k] for k in ("full", "small", "large")}))
+    assert re.search(r"^Take large: [^,]*\. small tells about as much, but lacks someth", alone)
+    nothing_known = evaluation.replace(needs=dict.fromkeys(evaluation.needs, 0.0), encoders=codes)
+    assert "smallest that does, of large and larger." in serving(nothing_known)
+    lost = codes["small"].loses
+    codes |= {label: codes[label].replace(loses=lost) for label in ("large", "larger")}
+    told = serving(evaluation.replace(encoders=codes))
+    assert told.startswith("Take small: it tells the change")
+    each = ", and is the smallest that does, of large, larger and small. But see what each lacks."
+    assert told.endswith(each)
+    alone = serving(evaluation.replace(encoders={k: codes[k] for k in ("full", "small")}))
+    assert alone.endswith("). But see what it lacks.")
 
 
 def test_nothing_is_said_where_it_cannot_be(evaluation):

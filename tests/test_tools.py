@@ -163,7 +163,7 @@ def test_scores_are_held_against_returns_of_the_same_encoders(tmp_path, capsys, 
     learned = tmp_path / "scores/learned.csv"
     learned.write_text("\n".join(("code,sha256,way,final", *rows)))
     monkeypatch.setattr(worth, "good_codes", lambda known: ["slow-8", "dae-8"])
-    monkeypatch.setattr(worth, "lacking", lambda known: {"slow-8": ["yaw"], "dae-8": []})
+    monkeypatch.setattr(worth, "recommended", lambda known: "dae-8")
     monkeypatch.setattr(worth, "read_tables", lambda folder: tables)
     monkeypatch.setattr(worth, "read_document", lambda path, kind: evaluation)
     monkeypatch.setattr(worth, "headline", lambda known: known)
@@ -180,8 +180,8 @@ def test_scores_are_held_against_returns_of_the_same_encoders(tmp_path, capsys, 
     assert lines[8][0].endswith("and clearly above both others: it is so")
     assert lines[12] == ["task", "0 to 0.05", "0.05 to 0.1", "0.1 to 0.2", "0.2 or more"]
     assert lines[13][1:] == ["0 of 0"] * 3 + ["0 of 10"]
-    assert lines[17][1:] == ["should serve", "and lack nothing", "the others", "best of all"]
-    assert lines[18] == [FACE, "2: 35", "1: 30", "3: 13", "slow-8 40"]
+    assert lines[17][1:] == ["to take", "should serve", "the others", "best of all"]
+    assert lines[18] == [FACE, "dae-8 30", "2: 35", "3: 13", "slow-8 40"]
     assert lines[22] == ["code", "rewarded", "trees", "a short run", "a whole run", "final return"]
     assert lines[23] == ["slow-8", "-40", "1,600", "-40", "40", "40"]
     assert [line[0] for line in lines[23:]] == ["slow-8", "dae-8", "pca-8", "vae-8", "ofe-64"]

@@ -10,8 +10,8 @@ Whole runs show the most that one of them can say.
 Printed is Spearman's correlation in each task, and its mean over tasks with a 95 % interval over
 families of codes, and by how much that is above *rewarded* and above the short run. What was hoped
 for was written down before the first run: see PRIMARY. Then how often, of two codes, the one with
-more *rewarded* returned more; what the codes returned that `jbrep evaluate` said should serve; and,
-for each task, what was said of every code and what its agents returned.
+more *rewarded* returned more; what the codes returned that should serve by the first line of
+`jbrep evaluate`; and, for each task, what was said of every code and what its agents returned.
 """
 
 import csv
@@ -28,7 +28,7 @@ from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.table import headline
 from jbrep.records.document import read_document
-from jbrep.report.serving import good_codes, lacking
+from jbrep.report.serving import good_codes, recommended
 from jbrep.report.tables import Tables, read_tables
 from jbrep.stats.association import difference, mean_rank_correlation
 from jbrep.stats.bootstrap import Array, Interval
@@ -53,7 +53,7 @@ class Scored(NamedTuple):
         pairs: for each run that is left out, by what ranks the codes.
         returns: the mean final return of each code, (n,).
         good: the codes that should serve, by their evaluation.
-        whole: those of them that lack nothing that a controller needs.
+        taken: the one to take.
     """
 
     task: str
@@ -62,7 +62,7 @@ class Scored(NamedTuple):
     pairs: Mapping[str, Pairs]
     returns: Array
     good: list[str]
-    whole: list[str]
+    taken: str | None
 
 
 def read(folder: Path) -> Scored:
@@ -87,15 +87,14 @@ def read(folder: Path) -> Scored:
     }
     for name, single in ((SHORT, short), (WHOLE, whole)):
         pairs[name] = [*zip(single.T, others.T, strict=True)]
-    good, lacks = good_codes(evaluation), lacking(evaluation)
     return Scored(
         task=evaluation.data.task,
         codes=codes,
         families=[kinds[code] for code in codes],
         pairs=pairs,
         returns=finals.mean(1),
-        good=good,
-        whole=[code for code in good if not lacks[code]],
+        good=good_codes(evaluation),
+        taken=recommended(evaluation),
     )
 
 
@@ -171,16 +170,16 @@ def apart(task: Scored) -> Iterator[str]:
 
 
 def advised(task: Scored) -> tuple[str, ...]:
-    """What codes returned that should serve, and those of them that lack nothing; and others."""
+    """What the code to take returned, those that should serve on average, the others, the best."""
     returns = dict(zip(task.codes, task.returns, strict=True))
     others = [code for code in task.codes if code not in task.good]
-    groups = task.good, task.whole, others
     told = (
         f"{len(codes)}: {np.mean([returns[code] for code in codes]):.0f}" if codes else "none"
-        for codes in groups
+        for codes in (task.good, others)
     )
     best = max(returns, key=returns.__getitem__)
-    return task.task, *told, f"{best} {returns[best]:.0f}"
+    taken = f"{task.taken} {returns[task.taken]:.0f}" if task.taken else "none"
+    return task.task, taken, *told, f"{best} {returns[best]:.0f}"
 
 
 def by_code(task: Scored) -> Table:
@@ -236,8 +235,8 @@ def main(*folders: str) -> None:
     differences.append(f"{APART[-1]:g} or more")
     title = f"Of two codes, how often that with more {REWARDED} returned more, by their difference"
     print(f"\n{Table(title, ('task', *differences), [(e.task, *apart(e)) for e in tasks]).text()}")
-    title = "How many codes should serve by jbrep evaluate, and their mean final return"
-    header = ("task", "should serve", "and lack nothing", "the others", "best of all")
+    title = "Mean final returns of the code to take by jbrep evaluate, and of all that should serve"
+    header = ("task", "to take", "should serve", "the others", "best of all")
     print(f"\n{Table(title, header, [advised(each) for each in tasks]).text()}")
     for each in tasks:
         print(f"\n{by_code(each).text()}")

@@ -1,6 +1,6 @@
 """Which codes serve a controller as the full observation does, in a sentence."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from jbrep.encoders import FULL
@@ -27,8 +27,9 @@ class _Measured(NamedTuple):
 
     @property
     def good(self) -> list[str]:
-        """The codes that tell about as much as the full observation."""
-        return [label for label, r2 in self.r2.items() if r2 >= _AS_GOOD * self.full]
+        """The codes that tell about as much as the best of all, the full observation among them."""
+        least = _AS_GOOD * max((self.full, *self.r2.values()))
+        return [label for label, r2 in self.r2.items() if r2 >= least]
 
 
 def good_codes(evaluation: Evaluation) -> list[str]:
@@ -48,43 +49,46 @@ def serving(evaluation: Evaluation) -> str:
         )
     if not measured.r2:
         return f"The full observation alone: R² {r2_text(measured.full)} of {measured.what}."
-    good = measured.good
-    if not good:
+    take = recommended(evaluation)
+    if take is None:
         nearest, r2 = next(iter(measured.r2.items()))
         return (
             f"No code should serve as the full observation does. {nearest} comes nearest: it tells "
-            f"{_told(measured, [r2])}."
+            f"{_told(measured, r2)}."
         )
-    told = _told(measured, [measured.r2[label] for label in good])
-    lost = [label for label in good if lacking(evaluation)[label]]
-    if len(good) == 1:
-        answer = f"{good[0]} should serve a controller: it tells {told}."
-    else:
-        answer = (
-            f"{enumerated(good)} should serve a controller: each tells {told}. "
-            f"{_smallest(evaluation, good, lost)}."
-        )
-    return (
-        f"{answer} But see what {enumerated(lost)} {'lacks' if len(lost) == 1 else 'lack'}."
-        if lost
-        else answer
-    )
+    return f"Take {take}: it tells {_told(measured, measured.r2[take])}{_beside(evaluation, take)}"
 
 
-def _smallest(evaluation: Evaluation, good: Sequence[str], lost: Collection[str]) -> str:
-    """Which good code is the smallest, and where that lacks something, which without a loss."""
-    by_size = sorted(good, key=lambda label: evaluation.encoders[label].latent)
-    whole = [label for label in by_size if label not in lost]
-    return f"The smallest is {by_size[0]}" + (
-        f", and of those that lack nothing {whole[0]}" if by_size[0] in lost and whole else ""
-    )
+def recommended(evaluation: Evaluation) -> str | None:
+    """The smallest of the codes that should serve, if possible one that lacks nothing."""
+    good, lacks = good_codes(evaluation), lacking(evaluation)
+    whole = [label for label in good if not lacks[label]]
+    size = {label: evaluation.encoders[label].latent for label in good}
+    return min(whole or good, key=size.__getitem__, default=None)
 
 
-def _told(measured: _Measured, r2: Collection[float]) -> str:
+def _beside(evaluation: Evaluation, take: str) -> str:
+    """The end of the sentence on the code to take: of which it is the smallest, what lacks what."""
+    good, lacks = good_codes(evaluation), lacking(evaluation)
+    lost = [label for label in good if lacks[label]]
+    if take in lost:
+        if len(good) == 1:
+            return ". But see what it lacks."
+        return f", and is the smallest that does, of {enumerated(good)}. But see what each lacks."
+    whole = [label for label in good if label not in lost]
+    known = "" if untold(evaluation) else " and lacks nothing"
+    said = f", and is the smallest that does{known}, of {enumerated(whole)}"
+    end = f"{said if len(whole) > 1 else ''}."
+    if lost:
+        tells, lack = ("tells", "lacks") if len(lost) == 1 else ("tell", "lack")
+        end += f" {enumerated(lost)} {tells} about as much, but {lack} something."
+    return end
+
+
+def _told(measured: _Measured, r2: float) -> str:
     """What is told, and how well, beside the full observation."""
-    numbers = " to ".join(dict.fromkeys((r2_text(min(r2)), r2_text(max(r2)))))
     return (
-        f"{measured.what} over the next 10 steps with an R² of {numbers} (the full one: "
+        f"{measured.what} over the next 10 steps with an R² of {r2_text(r2)} (the full one: "
         f"{r2_text(measured.full)})"
     )
 
