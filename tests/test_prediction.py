@@ -179,6 +179,7 @@ def test_an_evaluation_is_told_in_one_screen(evaluation):
     assert len(shown.splitlines()) < 24
     assert shown.startswith("Take without idle: it tells the change of what the reward depends on")
     assert re.search(r"without load +load \((<0|0\.\d\d)\)\nwithout idle +nothing", shown)
+    assert re.search(r"\nfull +\d+ +0\.\d\d +0\.\d\d \[0\.\d\d, \d\.\d\d\] +0\.\d\d", shown)
 
 
 def test_the_smallest_code_without_a_loss_is_named_beside_a_smaller_one_with(evaluation):

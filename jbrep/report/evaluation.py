@@ -4,8 +4,8 @@ import sys
 from collections.abc import Iterator, Mapping
 
 from jbrep.encoders import FULL
-from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Scores, Worth
-from jbrep.evaluate.table import headline
+from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Score, Scores, Worth
+from jbrep.evaluate.table import SCALARS, headline
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.report.serving import lacking, serving, unreadable, untold
 from jbrep.report.worth import advice, conditioning, ranked
@@ -82,11 +82,18 @@ def _headline(evaluation: Evaluation) -> Table:
             (
                 label,
                 str(evaluation.encoders[label].latent),
-                *(r2_text(each[name]) for name in shown),
+                *(_told(evaluation.encoders[label], name) for name in shown),
             )
-            for label, each in numbers.items()
+            for label in numbers
         ],
     )
+
+
+def _told(known: Diagnostics, name: str) -> str:
+    """An R² of the headline; that by which codes are chosen with its interval."""
+    value, low, high = SCALARS[name].read(known) or Score(None, None, None)
+    is_chosen_by = name == "rewarded" and low is not None
+    return r2_text(value) + (f" [{r2_text(low)}, {r2_text(high)}]" if is_chosen_by else "")
 
 
 def _unseen(evaluation: Evaluation) -> Iterator[Table]:
