@@ -11,6 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 from jbrep.coordinates import INGREDIENTS, Coordinates, make_coordinates
 from jbrep.coordinates.coordinates import Part
 from jbrep.coordinates.invariance import check_invariant
+from jbrep.coordinates.nearest import continuous, nearest
 from jbrep.coordinates.placing import placed
 from jbrep.envs.description import describe
 from jbrep.envs.mujoco import turned_quaternion
@@ -113,9 +114,53 @@ def test_a_robot_is_put_back_where_it_stood(name):
     task = TASKS[name].plain
     made, rows = make_coordinates(task, "symmetry"), states(TASKS[name].plain)
     back = placed(task, made.inverse(made.forward(rows)), rows)
-    quaternion = back[:, task.groups["orientation"]]
-    quaternion *= np.sign((quaternion * rows[:, task.groups["orientation"]]).sum(1, keepdims=True))
-    np.testing.assert_allclose(back, rows, atol=1e-3)
+    np.testing.assert_allclose(nearest(task, back, rows), rows, atol=1e-3)
+
+
+def test_the_angle_of_a_robot_that_is_put_back_is_in_its_range():
+    """Where it heads, along the x axis as symmetry has it, and as it stood."""
+    swimmer = describe("Swimmer-v5")
+    ends = {"low": -np.pi, "high": np.pi, "unit": "rad"}
+    bearing = Feature(name="bearing", kind="angle", frame="world", **ends)
+    task = swimmer.replace(features=(bearing, *swimmer.features[1:]))
+    rows = np.zeros((2, task.size))
+    rows[:, 0] = 2.0, -3.0
+    as_seen = np.zeros((2, task.size))
+    as_seen[:, 0] = 0.0
+    np.testing.assert_allclose(placed(task, as_seen, rows)[:, 0], rows[:, 0])
+
+
+def test_the_same_states_are_compared_in_the_nearest_numbers():
+    task, rows = TASKS["face_direction"].plain, states(TASKS["face_direction"].plain)
+    place, angle = task.groups["orientation"], task.feature_names.index("angle_to_target")
+    others = rows.copy()
+    others[::2, place] *= -1
+    others[::3, angle] += 4 * np.pi
+    np.testing.assert_allclose(nearest(task, others, rows), rows, atol=1e-12)
+    turning = np.linspace(0, 3 * np.pi, 50)
+    path = np.repeat(rows[:1], 50, axis=0)
+    path[:, place] = np.column_stack((np.cos(turning), 0 * turning, 0 * turning, np.sin(turning)))
+    path[:, angle] = (turning + np.pi) % (2 * np.pi) - np.pi
+    jumps = path.copy()
+    jumps[:, place] *= np.where(path[:, [place.start]] < 0, -1, 1)  # as coordinates give it back
+    smooth = continuous(task, jumps)
+    np.testing.assert_allclose(smooth[:, place], path[:, place], atol=1e-12)
+    np.testing.assert_allclose(smooth[:, angle], turning, atol=1e-9)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-5, -1), (-5, 0), (-1, 5)])
+def test_an_offset_is_soft_by_its_largest_end(low, high):
+    task = TASKS["move_to_position"].plain
+    features = tuple(
+        f.replace(low=float(low), high=float(high)) if f.name.startswith("target") else f
+        for f in task.features
+    )
+    (polar,) = (
+        part
+        for part in make_coordinates(task.replace(features=features), "coordinates").parts
+        if part.formula == "polar"
+    )
+    assert polar.soft == pytest.approx(0.05)
 
 
 def test_a_turned_robot_moves_alike_until_chaos_parts_them():
@@ -204,6 +249,13 @@ def test_symmetry_is_tried_not_believed(env, said):
     task = describe(env)
     with pytest.raises(InputError, match=said):
         check_invariant(make_coordinates(task, "symmetry"))
+
+
+def test_symmetry_is_refused_whatever_the_unit_of_the_reward():
+    only = {"forward_reward_weight": 1e-9, "ctrl_cost_weight": 0, "contact_cost_weight": 0}
+    arguments = {**only, "healthy_reward": 0, "include_cfrc_ext_in_observation": False}
+    with pytest.raises(InputError, match="the reward is"):
+        check_invariant(make_coordinates(describe("Ant-v5", arguments), "symmetry"))
 
 
 def test_the_jitterbugs_symmetry_holds():

@@ -25,10 +25,10 @@ from jbrep.dae import DAE
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.manifest import open_shard, read_manifest
 from jbrep.dataset.scaling import SCALINGS
-from jbrep.encoders import load
+from jbrep.encoders import find, load
 from jbrep.errors import InputError
 from jbrep.evaluate.held_out import HeldOut
-from jbrep.evaluate.reconstruction import reconstruction
+from jbrep.evaluate.reconstruction import corruption, reconstruction
 from jbrep.methods import fit
 from jbrep.methods.controls import Full
 from jbrep.methods.fit import Fitter
@@ -221,6 +221,25 @@ def trained(data, memory, epochs, path=None):
     return trainer
 
 
+def test_a_checkpoint_of_a_large_network_can_be_read(tmp_path):
+    data = wide([60] * 4, features=40, folder=tmp_path)
+    large = DAE.of({"latent": 4, "architecture": "900,900"})
+    trainers = [
+        Trainer(
+            large.objective(data),
+            Schedule(learning_rate=5e-4, batch_size=64, epochs=1),
+            Windows(data, data.train, memory=1 << 30),
+            Windows(data, data.test, memory=0, most=9),
+        )
+        for _ in range(2)
+    ]
+    list(trainers[0].epochs())
+    checkpoint.save(trainers[0], {}, tmp_path / "at")
+    assert (tmp_path / "at").stat().st_size > 1 << 24
+    checkpoint.restore(trainers[1], {}, tmp_path / "at")
+    assert trainers[1].history == trainers[0].history
+
+
 def test_a_training_from_disk_is_that_from_memory_and_resumes_in_either(tmp_path):
     data = wide([700] * 8, features=40, folder=tmp_path)
     memory, disk = (trained(data, limit, epochs=2) for limit in (1 << 30, 1 << 18))
@@ -315,6 +334,37 @@ def test_on_symmetry_an_encoder_is_compared_over_what_symmetry_tells(data, tmp_p
     judged = reconstruction(ours, HeldOut(data)).ratio_to_pca
     assert judged.value == pytest.approx(expected, rel=1e-4)
     assert errors[0].sum() / errors[1].sum() < 0.95 * expected
+
+
+def test_a_quaternion_of_the_other_sign_is_no_error(data):
+    """Of a robot that heads backwards, where w changes its sign, turned by a hair."""
+    place = data.task.groups["orientation"]
+    rows = np.repeat(data.dataset["observation"][:1], 2, axis=0)
+    for row, angle in zip(rows, (np.pi - 0.01, np.pi + 0.01), strict=True):
+        row[place] = np.cos(angle / 2), 0, 0, np.sin(angle / 2)
+    ours = find("coordinates", data.task)
+    assert np.abs(lost(ours, rows, data, rows[::-1])[:, place]).max() < 0.02
+    assert np.abs(lost(find("full", data.task), rows, data, -rows)[:, place]).max() > 1
+
+
+def test_where_pca_loses_nothing_there_is_no_ratio(tmp_path):
+    random = np.random.default_rng(0)
+    moving = random.normal(size=(400, 3))
+    rows = np.column_stack((moving, moving[:, 0], moving.sum(axis=1)))
+    ends = np.arange(400) % 50 == 49
+    made = Dataset.write(tmp_path / "d", rows, random.uniform(-1, 1, (400, 1)), moving[:, 0], ends)
+    fitter = Fitter(made, tmp_path)
+    untrained = fitter.fit("untrained", latent=4).encoder
+    scaled = ScaledDataset(made)
+    assert ratio_to_pca(untrained, scaled) is None
+    assert reconstruction(untrained, HeldOut(scaled)).ratio_to_pca is None
+
+
+def test_noise_counts_over_what_symmetry_tells(data):
+    """A code that only leaves out what isn't told takes no noise away."""
+    ours = find("symmetry", data.task)
+    level = corruption(ours, HeldOut(data))[2]
+    assert level.mse.value > 1.1 * level.input_mse
 
 
 @pytest.mark.parametrize("kind", ["linear-forward", "vamp", "self-prediction"])

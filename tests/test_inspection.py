@@ -442,6 +442,22 @@ def test_a_code_that_cannot_decode_is_read_by_regression(walk, others, walker):
     assert fan.explained[3, 0] > 0.9
 
 
+def test_a_fan_of_symmetry_goes_out_from_where_the_robot_stands(rollout):
+    """It is drawn in the world, though the code doesn't tell where the robot is."""
+    examples = Examples([rollout.observation], [rollout.action], "this same episode")
+    fan = make_fan(rollout, find("symmetry", rollout.task), examples)
+    np.testing.assert_allclose(fan.lines["taken"][:, 0], fan.truth[:, 0], atol=2e-3)
+
+
+def test_coordinates_give_back_all_but_the_sign_of_a_quaternion(rollout, tmp_path):
+    turned = rollout.observation.copy()
+    turned[:, rollout.task.groups["orientation"]] *= -1
+    other = replace(rollout, observation=turned)
+    record_episode(other, tmp_path / "a.rrd", find("coordinates", rollout.task))
+    error = scalars(read(tmp_path / "a.rrd")["/error/total"])
+    assert np.abs(error).max() < 1e-3
+
+
 def test_too_little_to_predict_from(walk, walker):
     full = find("full", walker)
     few = Examples(walk.observations[:1], walk.actions[:1], "")

@@ -138,6 +138,7 @@ def test_forward_finds_what_the_action_moves_among_noise(hidden, weights):
     assert (explained(code, wanted) > 0.97).all()
     ((weight, bias, _),), _ = principal_code(hidden, 2)
     assert (explained(rows @ weight.T + bias, wanted) < 0.5).any()
+    assert set(report["1"]) == {name for name, weight in weights.items() if name != "inverse"}
     if not used["inverse"]:
         noise = NOISY / (2 + NOISY)  # the share of the features that can't be predicted
         assert report["1"]["values"] == pytest.approx(noise, abs=0.1)
@@ -187,7 +188,7 @@ def test_deepmdp_keeps_its_functions_smooth(data):
     ("kind", "settings", "said"),
     [
         ("forward", {"changes": 0, "values": 0, "reward": 0}, "nothing to predict"),
-        ("forward", {"horizons": "1,1000"}, "no episode of .* is longer than 1000 steps"),
+        ("forward", {"horizons": "1,1000"}, "no held-out episode of .* has more than 1,000 steps"),
         ("self-prediction", {"latent": 1}, "at least 2"),
         ("deepmdp", {"reward": 0}, "above 0"),
     ],

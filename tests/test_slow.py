@@ -197,8 +197,11 @@ def test_a_block_stays_small_where_most_episodes_are_too_short(tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"kind": "slow", "lags": 500}, "no episode of .* is longer than 500 steps"),
-        ({"kind": "linear-forward", "horizons": 500}, "no episode of .* is longer than 500 steps"),
+        ({"kind": "slow", "lags": 500}, "no training episode of .* has more than 500 steps"),
+        (
+            {"kind": "linear-forward", "horizons": 500},
+            "no training episode of .* has more than 500 steps",
+        ),
         ({"kind": "slow", "latent": 5}, "latent size is 5: with 4 features it must be from 1 to 4"),
         (
             {"kind": "linear-forward", "latent": 2, "changes": 0, "values": 0, "horizons": 5},
@@ -234,8 +237,24 @@ def test_a_constant_feature_passes_around_or_is_refused(tmp_path):
 
 def test_actions_that_follow_from_the_state_leave_vamp_nothing(tmp_path):
     driven = system(tmp_path / "driven", actions=lambda state: 0.05 * state[:2])
-    with pytest.raises(InputError, match="as of linear functions of the actions"):
+    with pytest.raises(InputError, match="as of linear functions of each other or the actions"):
         made(driven, "vamp", latent=2)
+
+
+@pytest.mark.parametrize("kind", ["linear-forward", "forward"])
+def test_the_unit_of_the_reward_does_not_matter(kind, moved, tmp_path):
+    source = moved.dataset
+    ends = np.zeros(len(source), bool)
+    ends[np.cumsum(source.episodes["length"]) - 1] = True
+    how = {"latent": 2, "horizons": 5, "reward": 100}
+    how |= {"epochs": 1} if kind == "forward" else {}
+    found = []
+    for unit in (1, 2.0**-40):
+        columns = source["observation"][:], source["action"][:], source["reward"][:] * unit
+        data = Dataset.write(tmp_path / f"data-{unit}", *columns, ends)
+        found.append(Fitter(data, tmp_path / f"{unit}").fit(kind, **how).encoder)
+    one, tiny = (each.encoder[0].weight for each in found)
+    assert one.tobytes() == tiny.tobytes()
 
 
 def test_rewards_that_never_vary_say_nothing(tmp_path, still):

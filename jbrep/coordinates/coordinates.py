@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from functools import cached_property
 from types import SimpleNamespace
@@ -161,7 +161,7 @@ class Coordinates:
                 known[step] = coordinates[..., 0] * 0
             else:
                 _calculate(library, step, known)
-        return library.stack([_in_range(known[each.name], each) for each in self.task.features], -1)
+        return library.stack([in_range(known[each.name], each) for each in self.task.features], -1)
 
     @cached_property
     def not_decoded(self) -> tuple[str, ...]:
@@ -172,26 +172,20 @@ class Coordinates:
     def _steps_back(self) -> Iterator["_Step | str"]:
         """Steps that lead from coordinates to features; the name of a feature sets it to 0."""
         known = set(self.names)
-        for name in (None, *self.task.feature_names):
-            if name is not None and name not in known:
+        left = [
+            way
+            for part in self.parts
+            for way in (
+                _Way(_Step(part, True), {*part.gives, *part.beside}, part.solved),
+                _Way(_Step(part, False), {*part.of}, part.gives),
+            )
+        ]
+        yield from _allowed(known, left)
+        for name in self.task.feature_names:
+            if name not in known:
                 yield name
                 known.add(name)
-            yield from self._allowed(known)
-
-    def _allowed(self, known: set[str]) -> Iterator[_Step]:
-        """All steps that what is known allows; adds to it."""
-        before = None
-        while before != len(known):
-            before = len(known)
-            for part in self.parts:
-                ways = (
-                    (True, {*part.gives, *part.beside}, part.solved),
-                    (False, {*part.of}, part.gives),
-                )
-                for is_inverse, needs, gives in ways:
-                    if needs <= known and not known.issuperset(gives):
-                        yield _Step(part, is_inverse)
-                        known.update(gives)
+                yield from _allowed(known, left)
 
     @cached_property
     def features(self) -> tuple[Feature, ...]:
@@ -201,6 +195,26 @@ class Coordinates:
             of = [known[name] for name in part.of]
             known |= zip(part.gives, _described(part, of), strict=True)
         return tuple(known[name] for name in self.names)
+
+
+class _Way(NamedTuple):
+    """A step with the names that it needs and those that it gives."""
+
+    step: _Step
+    needs: set[str]
+    gives: Collection[str]
+
+
+def _allowed(known: set[str], left: list[_Way]) -> Iterator[_Step]:
+    """All steps that what is known allows; adds to that, and removes ways that give nothing new."""
+    before = None
+    while before != len(known):
+        before = len(known)
+        for way in left:
+            if way.needs <= known and not known.issuperset(way.gives):
+                yield way.step
+                known.update(way.gives)
+        left[:] = [way for way in left if not known.issuperset(way.gives)]
 
 
 def _described(part: Part, of: list[Feature]) -> list[Feature]:
@@ -239,7 +253,7 @@ def _calculate(library: Any, step: _Step, known: dict[str, Any]) -> None:
         known.setdefault(name, column)
 
 
-def _in_range(values: Any, feature: Feature) -> Any:
+def in_range(values: Any, feature: Feature) -> Any:
     """An angle in its feature's range, or within half a turn of 0; other values as they are."""
     if not feature.is_angle:
         return values

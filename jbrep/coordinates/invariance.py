@@ -45,29 +45,33 @@ def check_invariant(coordinates: Coordinates) -> None:
     """
     task = coordinates.task
     envs: list[gymnasium.Env[Any, Any]] = []
-    names, compared = (*coordinates.names, "the reward"), 0
+    names, seen = (*coordinates.names, "the reward"), []
     try:
         for _ in range(2):
             envs.append(make_env(task.id, task.arguments, task.max_episode_steps))
         for seed in range(_SEEDS):
             for observations, rewards in _played(envs, task, seed):
-                seen = np.column_stack((coordinates.forward(observations), rewards))
-                apart = np.abs(seen[0] - seen[1]) / np.maximum(np.abs(seen).max(axis=0), 1)
-                compared += 1
-                worst = int(apart.argmax())
-                if apart[worst] > _SAME:
-                    raise InputError(
-                        f"{task.name} isn't the same for a turned robot: {names[worst]} is "
-                        f"{seen[0][worst]:.4g} without a quarter turn and {seen[1][worst]:.4g} "
-                        "after one; use coordinates in place of symmetry"
-                    )
+                seen.append(np.column_stack((coordinates.forward(observations), rewards)))
     finally:
         for env in envs:
             env.close()
-    if not compared:
+    if not seen:
         raise InputError(
             f"symmetry can't be tried on {task.name}: its episodes under random actions end within "
             f"{_BEFORE} steps; use coordinates"
+        )
+    both = np.array(seen)  # (steps, 2, numbers)
+    sizes = np.abs(both).max(axis=(0, 1))
+    sizes[:-1] = np.maximum(sizes[:-1], 1)  # a reward may be in any unit
+    apart = np.abs(both[:, 0] - both[:, 1]) / np.where(sizes, sizes, 1)
+    wrong = np.flatnonzero(apart.max(axis=1) > _SAME)
+    if len(wrong):
+        worst = apart[wrong[0]].argmax()
+        as_it_is, turned = both[wrong[0], :, worst]
+        raise InputError(
+            f"{task.name} isn't the same for a turned robot: {names[worst]} is {as_it_is:.4g} "
+            f"without a quarter turn and {turned:.4g} after one; use coordinates in place of "
+            "symmetry"
         )
 
 

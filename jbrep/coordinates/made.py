@@ -164,11 +164,12 @@ class _Maker:
         )
 
     def _offset(self, unit: _Features) -> None:
-        self._polar(_word(unit), self._vector(unit)[:2], unit[0])
+        self._polar(_word(unit), self._vector(unit)[:2], unit)
 
-    def _polar(self, name: str, plane: _Names, like: Feature) -> None:
+    def _polar(self, name: str, plane: _Names, like: _Features) -> None:
         if "distance" in self._used:
-            soft = _SOFT * (like.high or 1.0)
+            ends = [abs(end or 0.0) for each in like[:2] for end in (each.low, each.high)]
+            soft = _SOFT * (max(ends) or 1.0)
             _, *turn = self._add(f"{name}_at", "polar", plane, soft=soft)
             self._directions.append((f"{name}_at", tuple(turn)))
 
@@ -185,7 +186,7 @@ class _Maker:
         if not self._heading:
             raise self._unturned(unit)
         plane = self._add(_word(unit), "turned", (*apart, *self._heading))
-        self._polar(_word(unit), plane, unit[0])
+        self._polar(_word(unit), plane, unit)
 
 
 def units(task: Task) -> Iterator[tuple[slice, _Features]]:

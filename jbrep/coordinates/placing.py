@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.coordinates.coordinates import in_range
 from jbrep.coordinates.made import attitude_of, units
 from jbrep.envs.task import Task
 
@@ -33,7 +34,7 @@ def placed(task: Task, rows: Array, like: NDArray[Any]) -> Array:
             parts = upright.real, tilted.real, tilted.imag, upright.imag
             moved[:, place] = np.column_stack(parts)
         elif unit[0].frame == "world" and unit[0].kind == "angle":
-            moved[:, place.start] += np.angle(turn)
+            moved[:, place.start] = in_range(rows[:, place.start] + np.angle(turn), unit[0])
         elif unit[0].frame == "world":
             first = slice(place.start, place.start + 2)
             plane = (rows[:, first] @ (1, 1j)) * turn

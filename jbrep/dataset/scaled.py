@@ -1,5 +1,6 @@
 """A data set prepared for learning representations: split by episode, scaled to [-1, 1]."""
 
+import math
 from collections.abc import Collection, Iterator
 from copy import copy
 from functools import cached_property
@@ -131,11 +132,20 @@ class ScaledDataset:
         return any((part != first).any() for part in parts)
 
     def rewards(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Rewards of the rows, of the same shape; all 0 where the data have none."""
+        """Rewards of the rows, of the same shape, within [-1, 1]; all 0 where the data have none.
+
+        They are in a unit that is a power of two, so that no digit is lost.
+        """
         if self.dataset.manifest.settings.unrewarded:
             return np.zeros(rows.shape, np.float32)
-        rewards: NDArray[np.float32] = self.dataset["reward"][rows]
-        return rewards
+        return np.ldexp(self.dataset["reward"][rows], -self._reward_exponent)
+
+    @cached_property
+    def _reward_exponent(self) -> int:
+        """Of the least power of two that no reward of the training part is above."""
+        parts = self.dataset["reward"].parts(self.train)
+        most = max(float(np.abs(part).max()) for part in parts)
+        return math.ceil(math.log2(most)) if most else 0
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
         names = [feature.name for feature in self.scaler.features(self.task)]

@@ -54,6 +54,14 @@ class BaseEncoder(ABC):
         """Features that symmetry leaves out, such as where a robot is; decoded, it is at 0."""
         return ()
 
+    def comparable(self, decoded: Any, observation: Any) -> Any:
+        """What was decoded, (n, d), in the numbers in which it can be compared with observations.
+
+        These are its own but for codes on coordinates, which don't tell a quaternion's sign and
+        whole turns: theirs are those nearest to the observation.
+        """
+        return decoded
+
     @abstractmethod
     def encode(self, observation: Any) -> Any:
         """Encode observations (..., d) in physical units as latents (..., l)."""

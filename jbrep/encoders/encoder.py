@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.coordinates import is_torch, library_of
+from jbrep.coordinates.nearest import nearest
 from jbrep.dataset import Scaler
 from jbrep.encoders.base import BaseEncoder, OwnEncoder
 from jbrep.encoders.header import IMPORTED, MAX_MAGNITUDE, EncoderHeader
@@ -230,6 +231,11 @@ class Encoder(BaseEncoder):
     def not_decoded(self) -> tuple[str, ...]:
         """As for `BaseEncoder`."""
         return self.scaler.coordinates.not_decoded if self.scaler.coordinates else ()
+
+    def comparable(self, decoded: Any, observation: Any) -> Any:
+        """As for `BaseEncoder`."""
+        on_coordinates = self.scaler.coordinates is not None
+        return nearest(self.task, decoded, observation) if on_coordinates else decoded
 
     def check_task(self, task: Task) -> None:
         """As for `BaseEncoder`; other arguments, such as another body of the robot, will do."""

@@ -124,7 +124,7 @@ def _array(tensor: TensorProto) -> NDArray[np.generic]:
 def _fetch_all(tensors: Iterable[TensorProto], folder: Path) -> None:
     """Bring the numbers that tensors have in other files into the tensors."""
     contents: dict[str, bytes] = {}
-    total = 0
+    total = kept = 0
     for tensor in tensors:
         if tensor.data_location != TensorProto.EXTERNAL:
             continue
@@ -136,6 +136,9 @@ def _fetch_all(tensors: Iterable[TensorProto], folder: Path) -> None:
             )
         if name not in contents:
             contents[name] = _bytes(folder / name)
+            kept += len(contents[name])
+        if kept > _MAX_BYTES:
+            raise InputError(f"the model's other files have more than {_MAX_BYTES:,} bytes")
         start = int(where.get("offset", 0))
         end = start + int(where["length"]) if "length" in where else len(contents[name])
         total += end - start

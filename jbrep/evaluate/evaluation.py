@@ -59,7 +59,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
 
     mse: Score
     pca_mse: Score  # of PCA with as many components, fitted on the training part
-    ratio_to_pca: Score | None  # of the errors; None where the latent is as large as the state
+    ratio_to_pca: Score | None  # None of a latent as large as the state, or if PCA loses nothing
     features: tuple[FeatureError, ...]
     quantiles: dict[str, float]  # of rows' errors
     worst_episodes: tuple[EpisodeError, ...]

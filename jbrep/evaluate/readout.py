@@ -272,7 +272,8 @@ def correlation(encoder: BaseEncoder, held_out: HeldOut) -> Correlation:
     in the S-RL Toolbox, but other dimensions of the state are not counted as units.
 
     Its cost grows as latent units times dimensions of the state, so of a robot with more than 128
-    features only some dimensions are looked at, the same ones for every encoder: 48 of 348.
+    features, or a latent with more units, only some dimensions are looked at: 48 of 348. They are
+    the same ones for every encoder that has no more units than the robot has features.
     `state_dimensions` says how many there are. The rows are a sample of at most 50,000.
     """
     data = held_out.data

@@ -21,7 +21,7 @@ from jbrep.evaluate.evaluation import (
     scores,
 )
 from jbrep.evaluate.held_out import HeldOut, Rows
-from jbrep.methods.held_out import lost
+from jbrep.methods.held_out import NOTHING, lost
 from jbrep.methods.linear import linear_denoiser, principal_code
 from jbrep.stats.bootstrap import Array, bootstrap, by_episode, r_squared, variation
 from jbrep.training.objective import Layers
@@ -49,13 +49,14 @@ def reconstruction(encoder: BaseEncoder, held_out: HeldOut) -> Reconstruction:
     losses = _losses(encoder, held_out, held_out.data.test)
     quantiles = np.quantile(losses.by_row, _QUANTILES).tolist()
     ours, pca = losses.sums, held_out.once(_pca, encoder.latent_size)
-    decoded = [name not in encoder.not_decoded for name in held_out.data.task.feature_names]
+    decoded = _decoded(encoder, held_out)
     over_decoded = _means(ours[:, decoded]), _means(pca[:, decoded])
+    loses = over_decoded[1].sum() > NOTHING * held_out.row_counts.sum()
     is_smaller = encoder.latent_size < held_out.data.task.size
     return Reconstruction(
         mse=score(bootstrap(_mean, _means(ours), held_out.row_counts)),
         pca_mse=score(bootstrap(_mean, _means(pca), held_out.row_counts)),
-        ratio_to_pca=score(bootstrap(_mean, *over_decoded)) if is_smaller else None,
+        ratio_to_pca=score(bootstrap(_mean, *over_decoded)) if is_smaller and loses else None,
         features=_by_feature(ours, held_out, encoder.not_decoded),
         quantiles=dict(zip(map(str, _QUANTILES), quantiles, strict=True)),
         worst_episodes=_worst(losses.by_row, held_out),
@@ -66,14 +67,16 @@ def corruption(encoder: BaseEncoder, held_out: HeldOut) -> tuple[Corruption, ...
     """Errors of reconstructing clean rows from corrupted ones, at each noise level.
 
     They come with the error of the corrupted rows themselves, and with that of the best linear
-    denoiser of the same latent size at that level. All are of a sample of at most 100,000 rows.
+    denoiser of the same latent size at that level. All are of a sample of at most 100,000 rows, and
+    over the features that the encoder tells at all.
     """
+    decoded = _decoded(encoder, held_out)
     rows = sample(held_out.data.test, _CORRUPTED_ROWS)
     (counts,) = held_out.sums(rows, np.ones((len(rows), 1)))
     levels = []
     for noise in NOISES:
-        ours = _means(_losses(encoder, held_out, rows, noise).sums)
-        best = held_out.once(_best_linear, encoder.latent_size, noise)
+        ours = _means(_losses(encoder, held_out, rows, noise).sums[:, decoded])
+        best = _means(held_out.once(_best_linear, encoder.latent_size, noise)[:, decoded])
         levels.append(
             Corruption(
                 noise=noise,
@@ -83,6 +86,11 @@ def corruption(encoder: BaseEncoder, held_out: HeldOut) -> tuple[Corruption, ...
             )
         )
     return tuple(levels)
+
+
+def _decoded(encoder: BaseEncoder, held_out: HeldOut) -> list[bool]:
+    """Which features the encoder tells at all."""
+    return [name not in encoder.not_decoded for name in held_out.data.task.feature_names]
 
 
 def _means(sums: Array) -> Array:
@@ -120,10 +128,10 @@ def _errors(
 
 
 def _best_linear(held_out: HeldOut, latent: int, noise: float) -> Array:
-    """The sums over each group of the best linear denoiser's errors, (groups, 1)."""
+    """The sums over each group of the best linear denoiser's errors, of each feature."""
     data = held_out.data
     linear = _linear(data, linear_denoiser(latent, noise, data.moments))
-    return _means(_losses(linear, held_out, sample(data.test, _CORRUPTED_ROWS), noise).sums)
+    return _losses(linear, held_out, sample(data.test, _CORRUPTED_ROWS), noise).sums
 
 
 def _pca(held_out: HeldOut, latent: int) -> Array:

@@ -103,12 +103,13 @@ def make_fan(rollout: Rollout, encoder: BaseEncoder, examples: Examples) -> Fan 
     if not ahead:
         return None
     starts = np.arange(0, len(rollout) - ahead[-1] + 1, _EVERY)
-    latent, steps = encode(encoder, rollout.observation[starts]), [0, *ahead]
+    seen, steps = rollout.observation[starts], [0, *ahead]
+    latent = encode(encoder, seen)
     actions = {TAKEN: next_actions(rollout.action, ahead[-1])[starts]}
     actions |= held(task, len(starts), ahead[-1])
-    now = forecaster.read(latent)
+    now = forecaster.read(latent, seen)
     lines = {
-        name: np.stack([now, *(forecaster(latent, each, k) for k in ahead)], axis=1)
+        name: np.stack([now, *(forecaster(latent, seen, each, k) for k in ahead)], axis=1)
         for name, each in actions.items()
     }
     truth = columns(task, rollout.observation)[starts[:, None] + steps]

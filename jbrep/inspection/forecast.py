@@ -1,12 +1,12 @@
 """Forecasts of an encoder's code: what it and the next actions say of the next states."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from jbrep.coordinates.placing import placed
 from jbrep.dataset import Dataset
 from jbrep.dataset.scaled import sample
 from jbrep.encoders.base import BaseEncoder
@@ -101,21 +101,36 @@ class Forecaster:
                 inputs, change = map(np.concatenate, zip(*some, strict=True))
                 self._predictors[ahead] = _nonlinear(inputs, change)
         self.horizons = list(self._predictors)
-        self.read: Callable[[Array], Array] = lambda latent: columns(task, encoder.decode(latent))
+        self._encoder, self._task = encoder, task
         if not encoder.can_decode:
             wanted = [columns(task, rows) for rows in examples.observations]
-            self.read = ridge(np.concatenate(latents), np.concatenate(wanted))
+            self._read = ridge(np.concatenate(latents), np.concatenate(wanted))
 
-    def __call__(self, latent: Array, actions: NDArray[Any], ahead: int) -> Array:
+    def read(self, latent: Array, observation: NDArray[Any]) -> Array:
+        """The states read from codes: (n, columns) from (n, l).
+
+        Where a code doesn't tell where the robot is, it stands and heads as in observations (n, d).
+        """
+        if not self._encoder.can_decode:
+            return self._read(latent)
+        decoded = self._encoder.decode(latent).astype(np.float64)
+        if self._encoder.not_decoded:
+            decoded = placed(self._task, decoded, observation)
+        return columns(self._task, decoded)
+
+    def __call__(
+        self, latent: Array, observation: NDArray[Any], actions: NDArray[Any], ahead: int
+    ) -> Array:
         """The states read from the codes (n, columns) that many steps after codes (n, l).
 
         Args:
             latent: the codes.
+            observation: that they are of, (n, d).
             actions: from then on, (n, at least as many steps, m); later ones don't count.
             ahead: one of the horizons.
         """
         inputs = np.hstack((latent, actions[:, :ahead].reshape(len(latent), -1)))
-        return self.read(latent + self._predictors[ahead](inputs))
+        return self.read(latent + self._predictors[ahead](inputs), observation)
 
 
 def encode(encoder: BaseEncoder, observation: NDArray[np.float32]) -> Array:

@@ -112,8 +112,8 @@ def send_encoding(
         task, path = rollout.task, "reconstruction"
         titles = [str(f).replace(f.name, f"{f.name} decoded", 1) for f in task.features]
         send_features(recording, path, times, task, decoded, titles, is_faint=True)
-        true = encoder.scale(rollout.observation.astype(np.float64))
-        errors = encoder.scale(decoded) - true
+        true = rollout.observation.astype(np.float64)
+        errors = encoder.scale(encoder.comparable(decoded, true)) - encoder.scale(true)
         single, titles = errors.astype(np.float32), scaled_titles(task)
         send_features(recording, "error", times, task, single, titles)
         total = np.sqrt(np.square(errors).mean(axis=1, keepdims=True))

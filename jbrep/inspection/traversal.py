@@ -6,6 +6,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from jbrep.coordinates.nearest import continuous
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array, Feature
@@ -63,16 +64,16 @@ def record_traversal(rollout: Rollout, path: Path, encoder: BaseEncoder) -> None
         send_floor(recording, robot, places)
     summary = ["| unit | from | to | moves most |", "|---|---|---|---|"]
     for unit, (latent, place) in enumerate(zip(swept, places, strict=True)):
-        single, below = encoder.decode(latent), f"{TRAVERSE}/unit_{unit}"
-        decoded = single.astype(np.float64)
+        decoded, below = encoder.decode(latent).astype(np.float64), f"{TRAVERSE}/unit_{unit}"
         if robot:
             _send_robot(recording, robot, times, as_qpos(task, decoded), unit, place)
-        scaled = encoder.scale(decoded)
+        smooth = continuous(task, decoded)
+        scaled = encoder.scale(smooth)
         most = np.argsort(-np.ptp(scaled, axis=0))[:_MOST]
         recording.send_series(f"{below}/decoded", times, scaled, titles)
         recording.send_series(f"{below}/most", times, scaled[:, most], [titles[i] for i in most])
         ends = f"{latent[0, unit]:.2f} | {latent[-1, unit]:.2f}"
-        told = (_span(task.features[i], np.ptp(single[:, i])) for i in most)
+        told = (_span(task.features[i], np.ptp(smooth[:, i])) for i in most)
         summary.append(f"| {unit} | {ends} | {', '.join(told)} |")
     recording.send_text(f"{TRAVERSE}/summary", "\n".join(summary))
     recording.write(path, traversal_layout(len(swept), robot, places))

@@ -154,8 +154,8 @@ class Fitter:
         if isinstance(method, Learned):
             objective = method.objective(data)
             check_layers(*objective.layers())
+            windows = count_windows(data, objective.horizon)
             if not method.batch_size:
-                windows = count_windows(data, objective.horizon)
                 method = method.replace(batch_size=default_batch_size(windows))
         plan = Plan(method, data, _header(method, name, data), self._folder / f"{name}{SUFFIX}")
         plan.find()  # another encoder there is a mistake

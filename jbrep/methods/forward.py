@@ -219,12 +219,12 @@ class ForwardObjective(Objective):
     def report(self, windows: Windows) -> dict[str, Any]:
         """The loss by horizon: of changes, values and reward, unweighted; 1 for no prediction.
 
-        Of those that vary: there may be no reward.
+        Of those that have a weight and vary: there may be no reward.
         """
         batch = self.batch(windows, windows.numbers)
         errors = self._errors(batch, self.encoder(batch.now.T))
-        varies = self._deviation.squeeze(2).isfinite()
-        each = zip(PARTS, *(of.split(self._sizes, 1) for of in (errors, varies)), strict=True)
+        counts = self._deviation.squeeze(2).isfinite() & (self._weight > 0)
+        each = zip(PARTS, *(of.split(self._sizes, 1) for of in (errors, counts)), strict=True)
         by_part = {
             part: lost[:, some.any(0)].mean(1).tolist() for part, lost, some in each if some.any()
         }

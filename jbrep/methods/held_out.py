@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.coordinates import wrapped
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.header import EncoderHeader
 from jbrep.methods.linear import principal_code
+
+NOTHING = 1e-10  # mean squared error of features scaled to [-1, 1]: rounding
 
 
 def held_out_error(
@@ -39,8 +40,8 @@ def lost(
 ) -> NDArray[np.float32]:
     """What a reconstruction of rows (n, d) lacks, in half widths of the features in the data.
 
-    An encoder on coordinates is judged by what these tell of the rows: angles round the circle, and
-    a robot that symmetry puts at the origin as it stands there.
+    An encoder on coordinates is judged by what these tell of the rows: angles round the circle,
+    quaternions of either sign, and a robot that symmetry puts at the origin as it stands there.
 
     Args:
         encoder: that can decode.
@@ -49,13 +50,9 @@ def lost(
         given: rows that are encoded in their place, such as corrupted ones.
     """
     back = encoder.decode(encoder.encode(rows if given is None else given))
-    coordinates = encoder.scaler.coordinates if isinstance(encoder, Encoder) else None
-    if coordinates is None:
-        return (back - rows) / data.scaler.half_width
-    error = back - coordinates.inverse(coordinates.forward(rows))
-    turning = [i for i, each in enumerate(data.task.features) if each.is_angle]
-    error[:, turning] = wrapped(error[:, turning])
-    return error / data.scaler.half_width
+    if isinstance(encoder, Encoder) and (coordinates := encoder.scaler.coordinates):
+        rows = coordinates.inverse(coordinates.forward(rows))
+    return (encoder.comparable(back, rows) - rows) / data.scaler.half_width
 
 
 def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
@@ -76,4 +73,4 @@ def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
     header = EncoderHeader(kind="pca", name="pca", environment=data.task)
     pca = Encoder(header, data.scaler, *layers)
     ours, theirs = (held_out_error(each, data, encoder.not_decoded) for each in (encoder, pca))
-    return ours / theirs if theirs else None
+    return ours / theirs if theirs > NOTHING else None

@@ -184,15 +184,14 @@ def _partial(lagged: Lagged, data: ScaledDataset) -> tuple[Array, Array]:
     shared = now[:size, size:]
     inverse = np.linalg.pinv(now[size:, size:], hermitian=True)
     effect = shared @ inverse
-    whiten = whitening(
-        now[:size, :size] - effect @ shared.T, data, np.diag(now)[:size], "the actions"
-    )
+    others = "each other or the actions"
+    whiten = whitening(now[:size, :size] - effect @ shared.T, data, np.diag(now)[:size], others)
     correlations = []
     for mean, later, across in zip(lagged.later_mean, lagged.later, lagged.across, strict=True):
         both = across - np.outer(lagged.now_mean, mean)
         whole = later - np.outer(mean, mean)
         rest = whole - both[size:].T @ inverse @ both[size:]
         joint = both[:size] - effect @ both[size:]
-        after = whitening(rest, data, np.diag(whole), "the actions")
+        after = whitening(rest, data, np.diag(whole), others)
         correlations.append(whiten @ joint @ after.T)
     return whiten, np.array(correlations)

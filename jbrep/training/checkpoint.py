@@ -38,7 +38,9 @@ def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
     Raises:
         InputError: the file is damaged, or from other settings, data or versions.
     """
-    tensors, header = container.read(path, "checkpoint")
+    state = _state(trainer)
+    most = sum(tensor.nbytes for tensor in state.values()) + container.MAX_BYTES
+    tensors, header = container.read(path, "checkpoint", most)
     try:
         saved = from_plain(header, _Header)
     except InputError:
@@ -48,7 +50,6 @@ def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
             f"{path} belongs to another configuration: {differing}; choose another folder, or "
             "delete it to start over"
         )
-    state = _state(trainer)
     given = {name: torch.from_numpy(tensor) for name, tensor in tensors.items()}
     if _shapes(given) != _shapes(state):
         raise _damaged(path)

@@ -10,6 +10,7 @@ from torch import Tensor
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.errors import InputError
+from jbrep.text import counted
 from jbrep.training.rows import Load, Rows, available_memory, rows_of
 
 _WATCHED = 100_000  # held-out windows whose loss is reported after each epoch
@@ -130,16 +131,26 @@ def first_rows(data: ScaledDataset, rows: NDArray[np.int64], horizon: int) -> ND
     end = ends[np.searchsorted(ends, rows, side="right")]
     starts = np.flatnonzero(rows + horizon < end)
     if not len(starts):
+        part = "held-out" if len(rows) and rows[0] in data.test else "training"
         raise InputError(
-            f"no episode of {data.dataset.folder} is longer than {horizon} steps: look fewer steps "
-            "ahead"
+            f"no {part} episode of {data.dataset.folder} has more than {counted(horizon, 'step')}: "
+            "look fewer steps ahead"
         )
     return starts
 
 
 def count_windows(data: ScaledDataset, horizon: int) -> int:
-    """How many windows the training rows have."""
-    return len(first_rows(data, data.train, horizon))
+    """How many windows the training rows have.
+
+    Raises:
+        InputError: they have fewer than two, or the held-out rows have none.
+    """
+    first_rows(data, data.test, horizon)
+    if (count := len(first_rows(data, data.train, horizon))) < 2:
+        raise InputError(
+            f"the training episodes of {data.dataset.folder} have too few steps: collect more"
+        )
+    return count
 
 
 def watched_windows(data: ScaledDataset, horizon: int, device: torch.device) -> Windows:
