@@ -2,6 +2,7 @@
 
 import time
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -106,8 +107,14 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
     Raises:
         InputError: as `add_worth`.
     """
+    names = {label: slug(label)[-_MOST_LETTERS:] for label in encoders}
+    if len({*names.values()}) < len(names):
+        name, count = Counter(names.values()).most_common(1)[0]
+        raise InputError(
+            f"{count} of the encoders would be called {name} as folders: give them other names"
+        )
     jobs = {
-        (label, seed): _job(task, label, encoder, seed, folder)
+        (label, seed): _job(task, names[label], encoder, seed, folder)
         for label, encoder in encoders.items()
         for seed in range(RUNS)
     }
@@ -157,9 +164,8 @@ def _returns(
     return found
 
 
-def _job(task: Task, label: str, encoder: Any, seed: int, folder: Path) -> Job:
-    """A run on a code, by its label."""
-    name = slug(label)[-_MOST_LETTERS:]
+def _job(task: Task, name: str, encoder: Any, seed: int, folder: Path) -> Job:
+    """A run on a code, by its name."""
     run = Run.of(
         task,
         _ALGORITHM,

@@ -534,3 +534,15 @@ def test_curves_that_do_not_differ_at_all_have_no_spread():
     assert ratio_of_spreads(Curves(x, y, *how), 0.95, 0) == (0, 0, 0)
     assert ratio_of_spreads(Curves(y, x, *how), 0.95, 0)[::2] == (np.inf, np.inf)
     assert np.isnan(ratio_of_spreads(Curves(x, x, *how), 0.95, 0)).all()
+
+
+@pytest.mark.parametrize(("offset", "deviation"), [(-1000, 0.1), (3000, 0.3), (-1e4, 1), (0, 1)])
+def test_what_an_interval_excludes_has_a_small_p(offset, deviation):
+    """However far from 0 returns are, beside how much they differ."""
+    random, bounds = np.random.default_rng(0), Bounds()
+    for _ in range(20):
+        x, y = offset + deviation * random.normal(size=(2, 16))
+        x += 1.2 * deviation
+        _, low, high = difference_within(x, y, bounds, 0.95)
+        excluded = not low <= 0 <= high
+        assert (p_of_difference(x, y, bounds, 0) < 0.05) == excluded

@@ -15,7 +15,16 @@ from jbrep.stats.aggregates import aggregates
 from jbrep.stats.analysis import to_plain
 from jbrep.stats.association import difference, mean_rank_correlation, rank_correlation
 from jbrep.stats.comparison import probability_of_improvement
-from jbrep.stats.curves import bands, common_grid, final_return, iqm, mean_return, on_grid, steps_to
+from jbrep.stats.curves import (
+    bands,
+    common_grid,
+    compared,
+    final_return,
+    iqm,
+    mean_return,
+    on_grid,
+    steps_to,
+)
 from jbrep.stats.intervals import (
     Bounds,
     deviation,
@@ -27,6 +36,7 @@ from jbrep.stats.intervals import (
 from jbrep.stats.nested import components
 from jbrep.stats.reliability import drawdown, expected_shortfall, fixed_policy, within_runs
 from jbrep.stats.rules import Planned, Rules
+from jbrep.stats.runs import groups
 from jbrep.text import SIGNIFICANT, interval
 
 GRID = np.arange(0, 10_001, 1000)
@@ -68,6 +78,35 @@ def runs():
 @pytest.fixture(scope="module")
 def analysis(runs):
     return analyse(runs)
+
+
+@pytest.mark.parametrize("where", ["environment", "returns"])
+def test_runs_of_other_environments_or_evaluations_are_not_compared(where, runs):
+    few = make("dae-8", 9, 500)
+    other = {"environment": "Robot-v0, body=5", "returns": few.returns[:, :2]}[where]
+    with pytest.raises(InputError, match=r"different environments|episodes: report those of one"):
+        groups([*runs, make("dae-8", 9, 500, **{where: other})], "full")
+
+
+def test_a_failed_run_ends_with_the_worst_whatever_it_had(runs):
+    """Also where it failed after the last step that it is compared at."""
+    ended = [replace(run, final=run.returns[-1]) for run in runs]
+    late = make("dae-8", 9, 900)
+    steps = np.append(late.steps, late.steps[-1] + 1000)
+    returns = np.vstack((late.returns, late.returns[-1:]))
+    failed = {"steps": steps, "returns": returns, "total_steps": 12_000, "failed_at": 11_500}
+    (group,) = groups([*ended, replace(late, **failed)], "full").values()
+    assert compared(group).finals["dae-8"][-1] == 0
+
+
+def test_one_run_beats_another_as_often_as_pairs_do():
+    x, y = np.random.default_rng(0).integers(0, 5, (2, 7, 6)).astype(float)
+    pairs = (1 + np.sign(x[:, :, None] - y[:, None, :]).mean(axis=(1, 2))) / 2
+    np.testing.assert_allclose(
+        probability_of_improvement(x, y[:, :4]),
+        (1 + np.sign(x[:, :, None] - y[:, None, :4]).mean(axis=(1, 2))) / 2,
+    )
+    np.testing.assert_allclose(probability_of_improvement(x, y), pairs)
 
 
 def test_all_are_compared_with_the_baseline(runs, analysis):

@@ -43,8 +43,10 @@ from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.stats.rules import Rules
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, as_study, read_study
+from jbrep.study.packing import forecast
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.prepare import check, prepare
+from jbrep.study.record import runs_record
 from jbrep.study.representations import ByName
 from jbrep.study.results import read_runs, write_tables
 from jbrep.study.runner import Progress, on_this_machine, run_study
@@ -317,8 +319,26 @@ def test_what_is_finished_is_not_run_again_and_seeds_may_come(done, tmp_path, mo
     assert run_study(done, None, 1) == 0  # nothing is left to run
     assert {p: p.stat().st_mtime_ns for p in (done.folder / "runs").rglob("*.*")} == before
     other = Plan(TINY.replace(steps=90), done.folder)
-    with pytest.raises(InputError, match=r"another study: steps 80 \(now: 90\)"):
-        run_study(other, None, 1)
+    for use in (lambda: run_study(other, None, 1), lambda: forecast(other)):
+        with pytest.raises(InputError, match=r"another study: steps 80 \(now: 90\)"):
+            use()
+
+
+def test_a_study_that_is_refused_changes_nothing(done, tmp_path):
+    """Here by a run of the folder that is another."""
+    folder = shutil.copytree(done.folder, tmp_path / "it")
+    before = (folder / STUDY).read_bytes()
+    run = folder / "runs/face_direction/a2c/full/seed-0/run.json"
+    shutil.copy(folder / "runs/face_direction/a2c/full/seed-1/run.json", run)
+    with pytest.raises(InputError, match="seed-0"):
+        run_study(Plan(TINY.replace(seeds=(0, 1, 2)), folder), None, 1)
+    assert (folder / STUDY).read_bytes() == before
+
+
+def test_other_runs_in_its_folder_draw_nothing(done):
+    ended = {path.parent: read_run(path.parent) for path in done.folder.rglob(RUN)}
+    record = runs_record(done.folder, ended, {})
+    assert record.draws_of("sac+learning_starts=120") == {}
 
 
 def test_it_makes_data_and_encoders(tmp_path, monkeypatch):
@@ -552,6 +572,13 @@ def test_references_of_an_environment_that_is_not_here_stay(tmp_path):
     before = path.read_bytes()
     sha256 = write_references([(away, 2)], tmp_path, {})
     assert path.read_bytes() == before
+    here = describe("face_direction")
+    path.write_text(header + "face_direction,random,0,777.0\n")
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / REFERENCE_RETURNS).write_bytes(path.read_bytes())
+    known = write_references([(here, 1)], tmp_path / "b", {})  # of which runs.json says nothing
+    assert read_references(tmp_path / "b", known)["face_direction"]["random"] != [777.0]
+    path.write_bytes(before)
     assert read_references(tmp_path, sha256) == {"Away/Robot-v0": {"random": [1.0]}}
     path.write_text(header + "Away/Robot-v0,random,0,2.0\n")
     with pytest.raises(DamageError, match=r"references\.csv was changed"):

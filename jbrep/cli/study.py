@@ -69,6 +69,10 @@ def study(
 
     if dry_run and register:
         raise InputError("--dry-run and --register exclude each other: choose one")
+    if register and (workers or width or backend != "local"):
+        raise InputError("--register runs nothing: leave out --workers, --width and --backend")
+    if dry_run and backend != "local":
+        raise InputError("--dry-run forecasts this machine alone: leave out --backend")
     if not exists(study):
         raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jbrep.evaluate.evaluation import Diagnostics, Score, Scores
-from jbrep.records.tables import Columns, finite, read_csv, write_csv
+from jbrep.records.tables import Columns, csv_text, finite, read_csv, write_text
 
 DIAGNOSTICS = "diagnostics.csv"  # of a study, or beside encoders
 Values = Mapping[str, float | None]  # by the names of SCALARS; None where it isn't known
@@ -94,8 +94,13 @@ def write_diagnostics(path: Path, rows: Iterable[Diagnosed]) -> str:
     Raises:
         InputError: it can't be written.
     """
+    return write_text(path, diagnostics_text(rows))
+
+
+def diagnostics_text(rows: Iterable[Diagnosed]) -> str:
+    """The table as its file has it."""
     cells = ((*row[:3], *(_cell(row.values.get(name)) for name in SCALARS)) for row in rows)
-    return write_csv(path, [*_COLUMNS], cells)
+    return csv_text([*_COLUMNS], cells)
 
 
 def read_diagnostics(path: Path, sha256: str | None = None) -> list[Diagnosed]:

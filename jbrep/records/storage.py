@@ -226,6 +226,8 @@ def read_regular(path: Path, most: int) -> bytes:
         is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
         kind = MissingFileError if is_missing else InputError
         raise kind(f"can't read {path}: {error.strerror or error}") from error
+    except ValueError:  # a NUL character
+        raise InputError(f"can't read {str(path)!r}: no path has such a character") from None
 
 
 def read_file(path: Path, most: int) -> bytes:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from jbrep.errors import DamageError
-from jbrep.records.storage import read_regular, write_whole
+from jbrep.records.storage import exists, read_regular, write_whole
 
 _Row = TypeVar("_Row", bound=NamedTuple)
 Columns = Mapping[str, Callable[[str], Any]]  # by their names: what their cells are
@@ -28,14 +28,25 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Write a table, whole or not at all; returns its SHA-256.
+    """Write a table, whole or not at all, unless it is there already; returns its SHA-256.
 
     Raises:
         InputError: it can't be written.
     """
-    content = csv_text(columns, rows).encode()
-    write_whole(path, content)
-    return hashlib.sha256(content).hexdigest()
+    return write_text(path, csv_text(columns, rows))
+
+
+def write_text(path: Path, text: str) -> str:
+    """The same of a table as text."""
+    content = text.encode()
+    if not exists(path) or read_regular(path, _MAX_BYTES) != content:
+        write_whole(path, content)
+    return hash_of(text)
+
+
+def hash_of(text: str) -> str:
+    """The SHA-256 of a table as text."""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def read_csv(path: Path, columns: Columns, sha256: str | None = None) -> list[tuple[Any, ...]]:

@@ -18,7 +18,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         InputError: it can't be read, is empty or larger than a MiB, or isn't valid TOML.
     """
-    content = read_file(Path(os.path.realpath(path)), _MAX_BYTES)
+    is_possible = "\0" not in str(path)  # or else it is refused as it is read
+    content = read_file(Path(os.path.realpath(path)) if is_possible else path, _MAX_BYTES)
     try:
         return tomllib.loads(content.decode())
     except (ValueError, RecursionError) as error:

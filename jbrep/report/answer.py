@@ -28,6 +28,8 @@ _ALONE = {
 
 def answer(tables: Tables) -> list[str]:
     """Final returns beside policies that don't learn, by task; then what follows from them."""
+    if tables.analysis is None and tables.left_out:
+        return [f"There is nothing to compare: {'; '.join(tables.left_out)}."]
     if tables.analysis is None:
         return [
             f"There is nothing to compare: no cell has two runs of {tables.record.baseline} and of "
@@ -116,6 +118,8 @@ def _conclusion(analysis: Analysis) -> Iterable[str]:
         )
         if analysis.planned.rules.gains_over != "drives":
             yield f"As it was registered, gains count over {over(analysis.planned.rules)}."
+    elif analysis.planned.rules.primary:
+        yield "Nothing is decided yet: nothing that was registered has two runs a side."
     elif len(silent) < len(compared):
         runs = [len(label.seeds) for group in compared for label in group.labels]
         each = counted(runs[0], "run") if len({*runs}) == 1 else f"{min(runs)} to {max(runs)} runs"
@@ -137,11 +141,12 @@ def _decided(
             state: [name for name, verdicts in cells if verdicts[position].verdict == state]
             for state in (SUPPORTED, CONTRADICTED, UNDECIDED, NOT_YET, EXPLORATORY)
         }
-        if not names[SUPPORTED] + names[CONTRADICTED]:
+        if names[UNDECIDED] == [name for name, _ in cells]:
             silent.append(repr(claim))
             continue
         told = [f"{state} for {enumerated(which)}" for state, which in names.items() if which]
-        yield f"Decided: {claim!r} is {', '.join(told)}."
+        is_decided = names[SUPPORTED] + names[CONTRADICTED]
+        yield f"{'Decided' if is_decided else 'Not decided'}: {claim!r} is {', '.join(told)}."
     if silent:
         verb = "is" if len(silent) == 1 else "are"
         yield f"{enumerated(silent)} {verb} undecided{' everywhere' if len(cells) > 1 else ''}."

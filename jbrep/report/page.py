@@ -58,7 +58,8 @@ def _beside(analysis: Analysis | None) -> str:
 def _how(analysis: Analysis) -> str:
     """How comparisons are to be read."""
     if not any(group.is_judged for group in analysis.groups):
-        return "With 95 % intervals, from four runs on. Nothing was registered for a verdict."
+        which = "Nothing was" if not analysis.planned.rules.primary else "None of these was"
+        return f"With 95 % intervals, from four runs on. {which} registered for a verdict."
     return " ".join(
         (
             f"Each representation against {analysis.baseline}; open a cell for what it rests on. "

@@ -141,7 +141,7 @@ def _analyse_group(
     seed: int,
 ) -> GroupAnalysis:
     first, known = evaluated_run(group), compared(group)
-    starts = None if known.on_all_starts else first.returns.shape[1]
+    starts = None if known.on_all_starts or not len(first.steps) else first.returns.shape[1]
     played = {
         policy: mean_within(np.array(returns[:starts]), first.bounds, LEVEL)
         for policy, returns in references.items()

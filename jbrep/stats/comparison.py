@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import levene
+from scipy.stats import levene, rankdata
 
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.claims import CONTRADICTED, EXPLORATORY, NOT_YET, SUPPORTED, Verdict
@@ -97,7 +97,9 @@ def probability_of_improvement(x: Array, y: Array) -> Array:
     Mann and Whitney's statistic, as in Agarwal et al. 2021, "Deep Reinforcement Learning at the
     Edge of the Statistical Precipice".
     """
-    return (1 + np.sign(x[..., :, None] - y[..., None, :]).mean(axis=(-2, -1))) / 2
+    n, m = x.shape[-1], y.shape[-1]
+    ranks = rankdata(np.concatenate((x, y), axis=-1), axis=-1)[..., :n]
+    return (ranks.sum(axis=-1) - n * (n + 1) / 2) / (n * m)
 
 
 def _ratio_of_variances(x: Array, y: Array) -> Array:

@@ -127,8 +127,9 @@ def final_returns(
 
 
 def _end(run: RunCurve, curve: Array) -> float:
-    failed = run.failed_at is not None
-    return float(curve[-1] if failed or run.final is None else run.final.mean())
+    if run.failed_at is not None and run.failure_return is not None:
+        return run.failure_return
+    return float(curve[-1] if run.final is None else run.final.mean())
 
 
 class Compared(NamedTuple):

@@ -61,7 +61,7 @@ RESAMPLES = 2000
 UNDEFINED = Interval(np.nan, np.nan, np.nan)
 _FEWEST_FOR_RATIOS = 3  # with two runs Bonett's interval of a ratio covers 86 %
 FEWEST_RUNS = 4  # for an interval: three or fewer are better shown as points
-_LEAST_P, _MOST_P = 1e-12, 1 - 1e-12
+_LEAST_P, _MOST_P = 1e-12, 1 - 1e-6  # beyond, intervals are narrower than returns are told apart
 _FURTHEST = 1e3  # shares of a gain that are looked for
 
 

@@ -44,6 +44,7 @@ class RunCurve:
         reference_in_training: the same on the starts of `returns`; None if that is `reference`.
         solved: the return from which on the task counts as solved; None if unknown.
         trainer: what trained it, and how exactly; equal for all runs that are compared.
+        environment: what decides which returns there can be; equal likewise.
         final: the returns of the last evaluation, if it has more episodes than the others, (f,).
         encoder_seed: of the encoder, if the representation has several.
         failure_return: what the run counts as once it has failed; None for the floor.
@@ -68,6 +69,7 @@ class RunCurve:
     reference_in_training: float | None = None
     solved: float | None = None
     trainer: str = ""
+    environment: str = ""
     final: Array | None = None
     encoder_seed: int | None = None
     failure_return: float | None = None
@@ -258,6 +260,20 @@ def _check_task(runs: list[RunCurve], name: str) -> None:
             f"{name}: its runs are of different trainers: {', '.join(trainers)}; report those of "
             "one, or all with --across-trainers"
         )
+    if len(environments := sorted({run.environment for run in runs})) > 1:
+        raise InputError(
+            f"{name}: its runs are of different environments: {' and '.join(environments)}; report "
+            "those of one"
+        )
+    for what, counts in (
+        ("evaluations", {run.returns.shape[1] for run in runs if len(run.steps)}),
+        ("last evaluations", {len(run.final) for run in runs if run.final is not None}),
+    ):
+        if len(counts) > 1:
+            told = " and ".join(map(str, sorted(counts)))
+            raise InputError(
+                f"{name}: the {what} of its runs have {told} episodes: report those of one number"
+            )
     for what in _OF_TASK:
         values = sorted({str(getattr(run, what)) for run in runs})
         if len(values) > 1:

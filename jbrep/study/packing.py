@@ -140,6 +140,7 @@ def forecast(plan: Plan, workers: int | None = None, width: int | None = None) -
         InputError: as `run_study`, as far as that is known beforehand.
     """
     check(plan)
+    plan.check_folder()
     workers = workers or usual_workers(plan)
     packs = packed(plan, workers, width)
     examples = {_kind(pack): pack for pack in packs}

@@ -164,14 +164,13 @@ class Plan:
         several = self.study.data is not None and self.study.data.sets > 1
         return inside(self.folder, "data", slug(task), *([f"set-{number}"] if several else ()))
 
-    def write(self) -> None:
-        """Make the folder, and write what the study is.
+    def check_folder(self) -> None:
+        """Check that the folder is free, or holds this study.
 
         Raises:
-            InputError: the folder holds another study; only tasks, algorithms, representations and
-                seeds may change, of a registered study only seeds be added.
+            InputError: it holds another; only tasks, algorithms, representations and seeds may
+                change, of a registered study only seeds be added.
         """
-        make_folder(self.folder)
         if self.registration and (differing := self.registration.differences(self.study)):
             raise InputError(
                 f"{self.folder} holds the study registered on {self.registration.date[:10]}, and "
@@ -181,6 +180,25 @@ class Plan:
             raise InputError(
                 f"{self.folder} holds another study: {differing}; choose another --out"
             )
+
+    def begin(self) -> None:
+        """The same if nothing is there.
+
+        Raises:
+            InputError: as `check_folder`.
+        """
+        self.check_folder()
+        if not exists(self.folder / STUDY):
+            self.write()
+
+    def write(self) -> None:
+        """Make the folder, and write what the study is.
+
+        Raises:
+            InputError: as `check_folder`.
+        """
+        make_folder(self.folder)
+        self.check_folder()
         self.study.write(self.folder / STUDY)
 
     @property

@@ -34,6 +34,7 @@ _MOST = 1 << 53  # of a number: a float holds whole ones exactly
 Count = Annotated[int, Meta(ge=0, le=_MOST)]
 Size = Annotated[int, Meta(ge=1, le=_MOST)]
 Layer = tuple[Size, str]  # units and activation
+Layers = Annotated[tuple[Layer, ...], Meta(max_length=100)]
 
 
 class LabelSettings(SharedSettings, frozen=True, kw_only=True):
@@ -67,8 +68,8 @@ class EncoderFacts(Record, frozen=True, kw_only=True):
     kind: str
     size: Size  # of the observation
     latent_size: Count  # 0 if they differ
-    encoder: tuple[Layer, ...] = ()  # none of a user's own encoder
-    decoder: tuple[Layer, ...] = ()
+    encoder: Layers = ()  # none of a user's own encoder
+    decoder: Layers = ()
     training: Mapping[str, Any] = {}  # settings
     data: Mapping[str, Any] = {}  # that it was trained on
     metrics: Mapping[str, Any] = {}  # of the training
@@ -155,7 +156,8 @@ class RunsRecord(Document, frozen=True, kw_only=True):
 
     def draws_of(self, learner: str) -> Mapping[str, tuple[Any, ...]]:
         """The values of settings, one of which each seed of the study draws, of a learner."""
-        return self.study.learner(learner).draws if self.study else {}
+        is_its_own = self.study is not None and learner in self.study.algorithms
+        return self.study.learner(learner).draws if self.study and is_its_own else {}
 
     def settings_of(self, run: RunFacts) -> LabelSettings:
         """The settings of a run, without its seed and what depends on it."""

@@ -139,6 +139,9 @@ class ByFile(Representation, frozen=True, kw_only=True):
                 )
             if self.encoders and _ENCODER not in words:
                 raise InputError(f"its file {path} must contain {_ENCODER}, as there are several")
+        with_seed = [path for path in self._paths if _SEED in path]
+        if without := {*self._paths} - {*with_seed} if with_seed else ():
+            raise InputError(f"its file {min(without)} must contain {_SEED}, as others do")
 
     @property
     def _paths(self) -> Iterable[str]:

@@ -26,7 +26,9 @@ from jbrep.rl.files import (
     runs_below,
 )
 from jbrep.stats import Analysis, RunCurve, analyse
+from jbrep.stats.curves import common_grid
 from jbrep.stats.rules import Planned, Rules
+from jbrep.stats.runs import groups
 from jbrep.study.plan import STUDY
 from jbrep.study.record import RECORD, LabelSettings, RunFacts, RunsRecord, runs_record
 from jbrep.study.tables import (
@@ -42,6 +44,7 @@ from jbrep.study.tables import (
     table_hashes,
     write_references,
 )
+from jbrep.text import counted
 
 Ended = dict[Path, RunRecord]  # what run.json says of each run that has ended, by folder
 
@@ -101,6 +104,8 @@ def found(
     if across_trainers:
         runs = [replace(run, trainer="") for run in runs]
     compared, left_out = _comparable(runs, planned.rules.baseline)
+    compared, refused = _without_refused(compared, planned.rules.baseline)
+    left_out += refused
     try:
         analysis = analyse(compared, planned, references=references) if compared else None
         return analysis, left_out
@@ -161,6 +166,22 @@ def _comparable(runs: list[RunCurve], baseline: str) -> tuple[list[RunCurve], li
     return kept, sorted(alone.values())
 
 
+def _without_refused(runs: list[RunCurve], baseline: str) -> tuple[list[RunCurve], list[str]]:
+    """The runs of tasks and algorithms that there can be statistics of; why not of the others."""
+    by_group: dict[tuple[str, str], list[RunCurve]] = {}
+    for run in runs:
+        by_group.setdefault((run.task, run.algorithm), []).append(run)
+    kept, refused = list[RunCurve](), []
+    for some in by_group.values():
+        try:
+            for group in groups(some, baseline).values():
+                common_grid(group)
+            kept += some
+        except InputError as error:
+            refused.append(str(error))
+    return kept, refused
+
+
 def _tasks(runs: Iterable[RunRecord]) -> Iterable[tuple[Task, int]]:
     """The tasks of runs, with the most episodes that one was evaluated on at its end."""
     tasks: dict[str, tuple[Task, int]] = {}
@@ -218,6 +239,12 @@ def _prevented(record: RunsRecord, references: References, rules: Rules) -> dict
     }
 
 
+def _environment(task: Task) -> str:
+    """What decides which returns there can be, as text for a message."""
+    arguments = [f"{name}={value!r}" for name, value in task.arguments.items()]
+    return ", ".join([task.id, *arguments, counted(task.max_episode_steps, "step")])
+
+
 def _mean(returns: Sequence[float]) -> float | None:
     return float(np.mean(returns)) if len(returns) else None
 
@@ -265,6 +292,7 @@ def _curve(
         reference_in_training=_mean(counted_over[:episodes]),
         solved=task.solved_return,
         trainer=" ".join(trainer),
+        environment=_environment(task),
         final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
         encoder_seed=run.encoder_seed,
     )

@@ -129,13 +129,14 @@ def run_study(
     packed(plan, workers, width)  # so that too little memory shows before anything is written
     make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
-        plan.write()
+        plan.begin()
         prepare(plan)
         packs = packed(plan, workers, width)  # by the sizes of encoders that are there now
         if plan.study.verdicts.primary and not plan.has_begun:
             plan.register()
         for cell in plan.cells:  # so that any mistake shows before the first run
             Job(plan.run(cell), plan.folder_of(cell)).clear()
+        plan.write()  # not before: a study that is refused changes nothing
         if not unfinished:
             return 0
         progress = Progress(plan, unfinished)
@@ -154,8 +155,9 @@ def register_study(plan: Plan) -> Registration:
     check(plan)
     make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
-        plan.write()
+        plan.begin()
         prepare(plan)
+        plan.write()
         return plan.register()
 
 

@@ -15,15 +15,15 @@ from jbrep.evaluate.table import (
     DIAGNOSTICS,
     Diagnosed,
     Values,
+    diagnostics_text,
     headline,
     read_diagnostics,
-    write_diagnostics,
 )
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.play.sources import find_player
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
-from jbrep.records.tables import read_rows, rounded, write_csv
+from jbrep.records.tables import hash_of, read_rows, rounded, write_csv, write_text
 from jbrep.stats.scale import CONSTANT, LOOKING, RANDOM, STILL
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.text import slug
@@ -119,7 +119,8 @@ def write_references(
     Args:
         tasks: each with its number of episodes.
         folder: for the file.
-        before: what runs.json says of the tables. A file that is another is written anew.
+        before: what runs.json says of the tables. A file that is another is written anew, as one is
+            of which nothing is said.
         played_on: tasks by name as they were then; those that were others are played anew.
 
     Returns:
@@ -140,7 +141,7 @@ def write_references(
                 own = [row for row in there if (row.task, row.policy) == (task.name, policy)]
                 if played_on.get(task.name, task) != task:
                     own = []
-                if [row.episode for row in own] != [*range(episodes)]:
+                if not before or [row.episode for row in own] != [*range(episodes)]:
                     own = _played(task, policy, episodes) or own
                 if damage and not own:
                     raise damage
@@ -231,7 +232,12 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
     if exists(path):
         known = _there_too(path, record.tables.get(DIAGNOSTICS), used, known) | known
     rows = [row._replace(values=known[_key(row)]) for row in used if _key(row) in known]
-    tables = {**record.tables, DIAGNOSTICS: write_diagnostics(path, rows)}
+    text = diagnostics_text(rows)
+    tables = {**record.tables, DIAGNOSTICS: hash_of(text)}
+    if tables != record.tables:  # a kill in between leaves no hash of another table there
+        others = {name: sha256 for name, sha256 in tables.items() if name != DIAGNOSTICS}
+        record.replace(tables=others).write(runs)
+    write_text(path, text)
     if tables != record.tables:
         record.replace(tables=tables).write(runs)
     return list(_unknown(used, known))
