@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from jbrep.report.report import Report
     from jbrep.rl.controller import Controller
     from jbrep.rl.files import RunRecord
+    from jbrep.rl.job import Job
     from jbrep.study import Study
 
 
@@ -259,6 +260,7 @@ def evaluate(
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
+    from jbrep.evaluate.evaluation import EVALUATION
     from jbrep.records.storage import check_writable
 
     if agents and out is None:
@@ -268,15 +270,19 @@ def evaluate(
         from jbrep.worth import check
 
         check(scaled.dataset)
+    whole = Dataset(truth) if isinstance(truth, str | Path) else truth
+    if whole is not None:
+        from jbrep.evaluate.held_out import hidden_of
+
+        hidden_of(scaled.dataset, whole)
     if out is not None:
-        check_writable(Path(out))
+        check_writable(Path(out), (EVALUATION,))
     from jbrep.evaluate.diagnosis import diagnose, write  # imports torch
     from jbrep.play.sources import find_good_policy
 
     own_rewards = bool(scaled.dataset.manifest.settings.reward)
     found = find_all(encoders, scaled.task)
     good = find_good_policy(policy, scaled.task, own_rewards)
-    whole = Dataset(truth) if isinstance(truth, str | Path) else truth
     if out is None:
         return Judged(diagnose(found, scaled, good, whole))
     evaluation = write(found, scaled, Path(out), good, whole)
@@ -341,11 +347,8 @@ def train(
     job = Job(run, Path(out), threads or cores(), retries)
     if ended := job.result:
         _note(f"the run in {job.folder} had {ended.status} already: nothing was done")
-    elif not known.reproducible:
-        _note(
-            f"{known.name} is not reproducible: the same seed gives other numbers the next time, "
-            "and a run that is stopped can't be resumed"
-        )
+    else:
+        _note_limits(job)
     writers = []
     if wandb:
         from jbrep.rl.tracker import Tracker
@@ -447,6 +450,23 @@ def _tell_kept(folder: Path, policy: Mapping[str, Any]) -> None:
         if part["kind"] == TRAINED and exists(folder / part["file"]):
             known = f"{part['run']} acts as it did at step {part['step']:,}"
             _note(f"{known}, which {folder / part['file']} keeps")
+
+
+def _note_limits(job: "Job") -> None:
+    """Say of a run what can't come of it."""
+    settings = job.settings
+    if settings.steps <= settings.learns_from:
+        _note(
+            f"{settings.learner} learns from step {settings.learns_from:,} on: "
+            f"{settings.steps:,} steps leave the policy as it was drawn; take more, or another "
+            "preset"
+        )
+    if not settings.environment.reproducible:
+        _note(
+            f"{settings.task} is not reproducible: the same seed gives other numbers the next "
+            "time, and a run that is stopped can't be resumed; the policy of its last checkpoint "
+            "can be played and exported"
+        )
 
 
 def _note(line: str) -> None:

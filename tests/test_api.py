@@ -43,6 +43,20 @@ def test_from_states_to_a_policy(home):
     np.testing.assert_array_equal(policy(row), agent.policy(row))
 
 
+def test_what_is_too_short_to_learn_or_not_to_be_written_is_told_first(home, tmp_path, monkeypatch):
+    task = jbrep.Dataset(home / "data").task
+    with pytest.warns(Notice, match="sac-wide learns from step 25,600 on: 256 steps leave the pol"):
+        jbrep.train(task, tmp_path / "a", **QUICK | {"steps": 256, "evaluate_every": 256})
+    monkeypatch.setattr("jbrep.play.sources.find_good_policy", None)  # plays thirty episodes
+    (tmp_path / "junk").mkdir()
+    (tmp_path / "junk/a.txt").touch()
+    with pytest.raises(InputError, match="junk holds other things, such as a"):
+        jbrep.evaluate("pca-8", home / "data", tmp_path / "junk")
+    with pytest.raises(InputError, match="shows nothing that"):
+        jbrep.evaluate("pca-8", home / "data", tmp_path / "out", truth=home / "data")
+    assert not (tmp_path / "out").exists()
+
+
 def test_several_encoders_are_made_when_they_are_asked_for(home):
     out = home / "several"
     mistake = {"latent": [2, 99], "seeds": 2}

@@ -41,7 +41,7 @@ def test_a_run_from_training_to_its_returns(tmp_path):
         assert "returns on dae-8 at the end: " in said
         beside = r"standing still [\d.]+, constant drive [\d.]+, random [\d.]+; hand-written [\d.]+"
         told = " ".join(said.split())
-        assert re.search(rf"learned: without looking {beside} \(in 10 episodes\)", told)
+        assert re.search(rf"learned \(policies that don't look: {beside}; in 10 episodes\)", told)
     assert A2C.load(run / "policy.zip", device="cpu").observation_space.shape == (8,)
     told = jbrep("evaluate-policy", run, "--episodes", 2).output
     assert re.fullmatch(

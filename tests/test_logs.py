@@ -440,7 +440,17 @@ def test_a_header_may_follow_many_comments_and_rows_may_all_be_apart(tmp_path):
     how = ("--observations", "x", "--actions", "u", "--time", "t")
     assert len(imported(path, *how)[1]) == 2
     told = mistake("data", "import", path, *how, "--gap", "0.5", "--out", tmp_path / "apart")
-    assert "has no episode with a step" in told
+    assert "has no step: an episode needs two rows" in told
+
+
+def test_a_pause_within_an_episode_is_told(tmp_path):
+    path, how = tmp_path / "a.csv", ("--observations", "x", "--actions", "u", "--time", "t")
+    times = [*range(20), *range(80, 100)]
+    path.write_text("t,x,u\n" + "".join(f"{time},{time},0\n" for time in times))
+    said = " ".join(imported(path, *how)[0].split())
+    assert "1 pause ten times as long as the usual step or longer, within an episode" in said
+    said = imported(path, *how, "--gap", "30", out="cut")[0]
+    assert "the usual step" not in said
 
 
 def test_damaged_lerobot_data_sets_are_refused(tmp_path):
@@ -542,7 +552,7 @@ def test_the_page_on_logs_does_what_it_says(tmp_path, monkeypatch):
     assert [done.exit_code for done in told] == [0] * len(told) == [0] * 6, told
     assert "3 gaps of more than 0.5 s: an episode ends there" in told[0].output
     assert "1 missing reading (hold:3)" in told[0].output
-    assert "400 rows at 50 Hz, by the linear readings" in told[1].output
+    assert "400 rows at 50 Hz, interpolated" in told[1].output
     sys.modules.pop("my_rewards", None)
 
 

@@ -275,6 +275,7 @@ def test_code_is_a_class_or_a_function_that_makes_an_encoder_or_is_one(name):
     ("name", "message"),
     [
         ("no_such_module:Net", "can't import no_such_module: ModuleNotFoundError"),
+        ("nets.py:Net", "nets.py is a file: name its module, nets, from the folder that it is in"),
         ("test_own:Net", "can't make the encoder test_own:Net: AttributeError"),
         ("test_own:Spoilt", "can't make the encoder test_own:Spoilt: TypeError"),
         ("test_own:ROWS", "ndarray has neither `encode` nor `transform` and can't be called"),

@@ -33,6 +33,15 @@ def test_steps_between_rollouts_are_searched_where_gradient_steps_follow(preset,
     assert ("train_freq" in _space(run)) == (gradient_steps is None) == searched
 
 
+def test_nothing_is_searched_where_nothing_would_be_learned(tmp_path):
+    run = Run.of(TASK, "sac", steps=20_000)
+    with pytest.raises(
+        InputError, match="steps is 20,000, and sac-wide learns from step 25,600 on"
+    ):
+        tune(run, 2, 1, tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
 def test_a_stopped_search_resumes_to_the_same_trials(tmp_path):
     whole, parts = [], []
     best = tune(RUN, 3, 1, tmp_path / "whole", whole.append)

@@ -44,6 +44,7 @@ def export(policy: str, task: str | None, form: str, out: Path) -> None:
     the run's action_repeat says.
     """
     from jbrep.envs.description import describe
+    from jbrep.envs.names import modules_of
     from jbrep.play.sources import policy_file
     from jbrep.rl.controller import load_policy
     from jbrep.rl.export import described
@@ -51,14 +52,18 @@ def export(policy: str, task: str | None, form: str, out: Path) -> None:
     from jbrep.rl.shipped import SHIPPED
 
     if task and policy != SHIPPED:
-        raise InputError(f"{policy} has its own task: leave out --task")
+        raise InputError(
+            f"--task goes with {SHIPPED}, the policy that ships for it; {policy} must be a run's "
+            "folder or a policy's file, which say their own: leave out --task"
+        )
     controller = load_policy(policy_file(policy, describe(task) if task else None))
     write(controller, out, form)
     said, own = described(controller), controller.task
     rate = "" if said["rate"] is None else f", {said['rate']:g} times a second"
     say(f"{out}: {own.size} numbers of {own.name} to {own.action_size}{rate}")
     if form == "onnx":
-        check = ["jbrep", "policy", "check", str(out), "--run", policy]
+        modules = [f"--import={module}" for module in modules_of(own)]
+        check = ["jbrep", "policy", "check", str(out), "--run", policy, *modules]
         click.echo(f"check it with {shlex.join(check + (['--task', task] if task else []))}")
     else:
         click.echo(f"open it with torch.export.load({str(out)!r}).module()")

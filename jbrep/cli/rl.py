@@ -182,7 +182,7 @@ def _left(folder: Path) -> str:
 @click.option("--seeds", default=1, show_default=True, type=POSITIVE, help="Runs of each trial.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of the search and runs.")
 @record_options(
-    TrainingSettings, "steps", "evaluation_episodes", steps=20_000, evaluation_episodes=10
+    TrainingSettings, "steps", "evaluation_episodes", steps=100_000, evaluation_episodes=10
 )
 @click.option("--out", required=True, type=PATH, help="A folder for this search.")
 @domain_option

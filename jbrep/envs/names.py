@@ -82,6 +82,11 @@ def import_modules(modules: Iterable[str]) -> None:
         InputError: there is no such module, or its import fails.
     """
     for module in modules:
+        if module.endswith(".py") or "/" in module:
+            name = module.rpartition("/")[2].removesuffix(".py")
+            raise InputError(
+                f"{module} is a file: name its module, {name}, from the folder that it is in"
+            )
         try:
             if "" not in sys.path:
                 sys.path.append("")  # after all that is installed

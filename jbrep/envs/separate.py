@@ -234,11 +234,16 @@ class Separate:
             raise EnvironmentFailedError(
                 f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
                 f"reward that is not finite, at step {len(self._episodes[lane].actions)} of the "
-                f"episode with seed {self._episodes[lane].seed}; --missing says what becomes of it",
+                f"episode with seed {self._episodes[lane].seed}; {self._missing_said}",
                 lane,
             )
         filled = np.where(missing, self._observation[lane], flat)
         return filled, self._last_reward[lane] if is_missing else reward
+
+    @property
+    def _missing_said(self) -> str:
+        missing = self._task.missing
+        return f"that is beyond --missing {missing}" if missing else "--missing says what to do"
 
     def _lose(self, lane: int) -> None:
         """Let the episode of a lane end before the step that it just took."""

@@ -50,7 +50,7 @@ class HeldOut:
 
     def __init__(self, data: ScaledDataset, truth: Dataset | None = None):
         self.data, self._truth = data, truth
-        self.hidden = _hidden(data.dataset, truth) if truth else ()
+        self.hidden = hidden_of(data.dataset, truth) if truth else ()
         self._ends = np.cumsum(data.dataset.episodes["length"], dtype=np.int64)
         self.numbers = np.unique(self._episode(data.test))
         self.num_groups = min(len(self.numbers), MAX_GROUPS)
@@ -122,8 +122,12 @@ class HeldOut:
         return self.sums_of_parts(self.data.test, ((chunk, chunk**2) for chunk in scaled))
 
 
-def _hidden(dataset: Dataset, truth: Dataset) -> tuple[str, ...]:
-    """The features that a data set of the same motion has beside those of another."""
+def hidden_of(dataset: Dataset, truth: Dataset) -> tuple[str, ...]:
+    """The features that a data set of the same motion has beside those of another.
+
+    Raises:
+        InputError: the motion is another, or nothing is hidden.
+    """
     moved, seen = (
         [shard.sha256["action"] for shard in each.manifest.shards] for each in (truth, dataset)
     )

@@ -105,6 +105,11 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
         """Of training, as its agent counts them."""
         return self.hyperparameters.agent_steps(self.steps)
 
+    @property
+    def learns_from(self) -> int:
+        """The step from which its agent learns; until then it acts at random."""
+        return self.control_steps(self.hyperparameters.algorithm_kwargs.get("learning_starts", 0))
+
     def control_steps(self, agent_steps: int) -> int:
         """An agent's steps as runs count them: each for all control steps that hold its action."""
         return agent_steps * self.hyperparameters.action_repeat

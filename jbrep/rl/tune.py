@@ -92,9 +92,13 @@ def tune(
             failed.
         StoppedError: `stop` was true.
     """
-    search = Search(
-        settings=run.settings(run.find_encoder()), seeds=seeds, optuna=optuna.__version__
-    )
+    settings = run.settings(run.find_encoder())
+    if settings.steps <= settings.learns_from:
+        raise InputError(
+            f"steps is {settings.steps:,}, and {settings.learner} learns from step "
+            f"{settings.learns_from:,} on: take more, or another preset"
+        )
+    search = Search(settings=settings, seeds=seeds, optuna=optuna.__version__)
     make_folder(folder, (SEARCH, BEST, "trial-*"))
     with exclusive(folder):
         _claim(folder / SEARCH, search)

@@ -31,10 +31,10 @@ class Beside(NamedTuple):
     def __str__(self) -> str:
         shown = dict(zip(self.references, rounded(*self.references.values()), strict=True))
         written = shown.pop(LOOKING, None)
-        told = f"without looking {', '.join(f'{name} {value}' for name, value in shown.items())}"
+        told = ", ".join(f"{name} {value}" for name, value in shown.items())
         told += f"; {LOOKING} {written}" if written else ""
         played = counted(self.episodes, "episode")
-        return f"{_WORDS[self.learnt]}: {told} (in {played})"
+        return f"{_WORDS[self.learnt]} (policies that don't look: {told}; in {played})"
 
 
 def beside(task: Task, returns: Sequence[float] | Array, episodes: int) -> Beside | None:

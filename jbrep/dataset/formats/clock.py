@@ -17,6 +17,7 @@ Array = NDArray[Any]
 MOST_RAW = 20_000_000  # rows of what is cut, or brought to another clock
 _SLACK = 1e-6  # of a step, by which rounding may shift a time
 _LATE = 0.1  # of a step, by which a reading of an even clock may be late and count as on time
+_PAUSE = 10  # usual steps
 _EVEN = 0.1  # by which most steps of an even clock may differ from the median
 _SIGNALS = ("observation", "action", "reward")
 
@@ -42,6 +43,7 @@ class Clock:
             InputError: an episode comes in two parts.
         """
         number, before, known = 0, dict[str, Array](), set[int]()
+        usual: float | None = None  # step, by the first rows
         for rows in chunks:
             if not len(rows["time"]):
                 continue
@@ -60,6 +62,10 @@ class Clock:
                 begins |= flags(name, flag, ended)
             step = np.diff(rows["time"], prepend=last["time"])
             back, silent = step < 0, step > (self._layout.gap or np.inf)
+            if usual is None and (step > 0).any():
+                usual = float(np.median(step[step > 0]))
+            pauses = step >= _PAUSE * (usual or np.inf)
+            self._counts["pauses"] += int((pauses & ~begins & ~silent).sum())
             self._counts["back"] += int((back & ~begins).sum())
             self._counts["gaps"] += int((silent & ~begins).sum())
             numbers = number + np.cumsum(begins | back | silent)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jbrep.dataset.schema import UNKNOWN_SEED
 from jbrep.envs.task import MAX_FEATURES, Feature, Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, listed
 from jbrep.text import slug
 
 Array = NDArray[Any]
@@ -258,7 +258,10 @@ def check_names(name: str, columns: Iterable[str]) -> None:
     columns = set(columns)
     for needed in ("observation", "action"):
         if needed not in columns:
-            raise InputError(f"{name} has no {needed}s: it must have observations and actions")
+            raise InputError(
+                f"{name} has no {needed}s: of a log name their columns, as in --actions torque "
+                f"--observations 'joint_*'; it has {listed(sorted(columns)) or 'no columns'}"
+            )
     if not columns & {*ENDS, "episode", "step"}:
         raise InputError(
             f"{name} doesn't tell where an episode ends: give it terminations and truncations, or "

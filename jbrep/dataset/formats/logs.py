@@ -41,7 +41,11 @@ _SAID = {  # of what is counted: what it is, and what became of it
     "back": ("step", "back in time: an episode ends there"),
     "gaps": ("gap", "of more than {gap} s: an episode ends there"),
     "never": ("row", "of episodes in which a column has no reading: left out"),
-    "resampled": ("row", "at {rate:g} Hz, by the {fill} readings"),
+    "pauses": (
+        "pause",
+        "ten times as long as the usual step or longer, within an episode: --gap ends it there",
+    ),
+    "resampled": ("row", "at {rate:g} Hz, {fill}"),
     "stale": ("row", "of these without a reading of each column within {gap} s: left out"),
     "cuts": ("cut", "after {length} rows"),
     "last": ("row", "after the last action of an episode, or alone: no step begins there"),
@@ -250,7 +254,10 @@ class _Reader:
     def changes(self) -> dict[tuple[str, str], int]:
         """What was done to the rows that were read last, how often."""
         layout, counts = self._layout, self._counts
-        how = {name: getattr(layout, name) for name in ("gap", "rate", "fill", "length")}
+        how = {name: getattr(layout, name) for name in ("gap", "rate", "length")}
+        how["fill"] = (
+            "interpolated" if layout.fill == "linear" else f"by the {layout.fill} readings"
+        )
         told = [(*words, counts[what]) for what, words in _SAID.items() if counts[what]]
         return {(noun, said.format(**how)): count for noun, said, count in told}
 

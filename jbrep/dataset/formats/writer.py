@@ -154,8 +154,8 @@ def _survey(source: Source, missing: str) -> _Survey:
         if source.rows == 0:
             raise InputError(f"{source.name} has no rows")
         raise InputError(
-            f"{source.name} has no episode with a step, the last one's observation being the final "
-            "one where no other is given"
+            f"{source.name} has no step: an episode needs two rows, as the last one only says what "
+            "was observed after the last action"
         )
     low, high = low.astype(np.float32), high.astype(np.float32)
     return _Survey(lengths, sizes[0], low, high, signals)
