@@ -71,14 +71,14 @@ def study(
         raise InputError("--dry-run and --register exclude each other: choose one")
     if register and (workers or width or backend != "local"):
         raise InputError("--register runs nothing: leave out --workers, --width and --backend")
-    if dry_run and backend != "local":
-        raise InputError("--dry-run forecasts this machine alone: leave out --backend")
     if not exists(study):
         raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)
     from jbrep.study.runner import BACKENDS  # imports torch
 
     choose(backend, BACKENDS, "backend")
+    if dry_run and backend != "local":
+        raise InputError("--dry-run forecasts this machine alone: leave out --backend")
     folder = out or Path("runs") / study.stem
     if dry_run or register:
         _announce(study, folder, dry_run, workers, width)
