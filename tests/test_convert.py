@@ -478,6 +478,23 @@ def test_weights_are_read_from_a_regular_file_beside_the_model_alone(where, mess
         np.testing.assert_array_equal(imported.encoder[0].weight, weights.T)
 
 
+def test_files_beside_a_model_count_whole_towards_its_size(tmp_path, monkeypatch):
+    weights, bias = f32(16, 3), f32(3)
+    made = model("t = MatMul x w; y = Add t b", {"w": weights, "b": bias})
+    for tensor, numbers in zip(made.graph.initializer, (weights, bias), strict=True):
+        (tmp_path / tensor.name).write_bytes(numbers.tobytes() + bytes(200))
+        tensor.ClearField("raw_data")
+        tensor.data_location = TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value=tensor.name)
+        tensor.external_data.add(key="length", value=str(numbers.nbytes))
+    path = tmp_path / "it.onnx"
+    path.write_bytes(made.SerializeToString())
+    assert convert(path, TASK, None, "mine").encoder
+    monkeypatch.setattr("jbrep.encoders.from_onnx._MAX_BYTES", 500)
+    with pytest.raises(InputError, match="the model's other files have more than 500 bytes"):
+        convert(path, TASK, None, "mine")
+
+
 def test_sizes_of_ones_own_are_an_architecture(tmp_path):
     sizes = get_architecture("64,32")
     assert sizes == get_architecture("64x32")

@@ -441,7 +441,19 @@ def check_same(expected: Task, actual: Task, what: str) -> None:
             f"{expected.name}"
         )
     if actual.feature_names != expected.feature_names:
-        raise InputError(f"{what} was made for other features of {actual.name}")
+        mine = [name for name in actual.feature_names if name not in expected.feature_names]
+        here = [name for name in expected.feature_names if name not in actual.feature_names]
+        told = (
+            f", such as {mine[0]}, which isn't here"
+            if mine
+            else f", without {here[0]}"
+            if here
+            else ", in another order"
+        )
+        raise InputError(
+            f"{what} was made for other features of {actual.name}{told}: give the same --hide, "
+            "--history and --features"
+        )
     if (actual.offsets or {}) != (expected.offsets or {}):
         raise InputError(
             f"{what} was made for features of {actual.name} with other offsets: give those in "

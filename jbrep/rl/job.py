@@ -170,6 +170,19 @@ class Job:
                 f"{what}: its {CHECKPOINT} is gone; choose another folder, perhaps with --from"
             )
 
+    def check_can_go_on(self) -> None:
+        """Make sure, before anything is played again, that a run that was stopped can go on.
+
+        Raises:
+            InputError: its environment isn't reproducible.
+        """
+        if not self.run.task.reproducible and exists(self.folder / CHECKPOINT):
+            raise InputError(
+                f"{self.run.task.name} is not reproducible: the run in {self.folder} can't go on "
+                "where it stopped, but its policy can be played (jbrep evaluate-policy) and "
+                "exported; choose another folder"
+            )
+
     def clear(self) -> None:
         """Remove what a run that has ended may have left, if it was killed at the very end.
 

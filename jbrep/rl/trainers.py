@@ -56,6 +56,9 @@ def train_jobs(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
                 stack.enter_context(exclusive(job.folder))
         stack.enter_context(single_thread())
         results = {job: job.result for job in jobs}
+        for job in jobs:
+            if not results[job]:
+                job.check_can_go_on()
         yield from ((job, result) for job, result in results.items() if result)
         for trainer, train_own in _FUNCTIONS.items():
             own = [job for job in jobs if job.settings.trainer == trainer and not results[job]]
