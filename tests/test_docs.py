@@ -66,6 +66,7 @@ def test_the_studies_are_studies(block, request):
     assert as_study(tomllib.loads(block)).seeds == tuple(range(count))
 
 
+@pytest.mark.filterwarnings("ignore:sac-wide learns from step")
 def test_the_features_are_those_of_the_environment_shown(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(*ENVIRONMENT.values, "block", "exec"), {})

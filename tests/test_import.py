@@ -425,7 +425,7 @@ BAD_ARRAYS = {
     "observations of different sizes": {"observations": [[1, 2, 3]] * 19 + [[1, 2]]},
     "actions of type int64": {"actions": np.zeros((20, 1), int)},
     "has no rows": {n: v[:0] for n, v in arrays().items()},
-    "no episode with a step": {
+    "has no step: an episode needs two rows": {
         **{name: values[:1] for name, values in arrays().items()},
         "final_observations": None,
     },

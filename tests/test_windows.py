@@ -48,7 +48,8 @@ def test_windows_lie_within_episodes_and_have_the_data_sets_numbers(data, horizo
         steps = rows[:, None] + np.arange(horizon)
         actions = windows.actions(numbers, horizon)
         np.testing.assert_allclose(actions, arrays["action"][steps], atol=1e-6)
-        mean = arrays["reward"][steps].mean(axis=1, dtype=float)
+        mean = data.rewards(steps).mean(axis=1, dtype=float)
+        assert np.ptp(arrays["reward"][steps].mean(axis=1) / mean) < 1e-4  # in another unit
         np.testing.assert_allclose(windows.rewards(numbers, horizon), mean, atol=1e-6)
 
 
@@ -73,7 +74,9 @@ def test_a_pass_in_blocks_has_the_same_windows(data, monkeypatch):
 
 def test_a_horizon_that_no_episode_has_is_refused(data):
     for look in (lambda: Windows(data, data.train, 40), lambda: next(blocks(data, 40, 1, 1))):
-        with pytest.raises(InputError, match=r"no episode of .* longer than 40 steps: look fewer"):
+        with pytest.raises(
+            InputError, match=r"no training episode of .* has more than 40 steps: look fe"
+        ):
             look()
 
 

@@ -119,8 +119,7 @@ def write_references(
     Args:
         tasks: each with its number of episodes.
         folder: for the file.
-        before: what runs.json says of the tables. A file that is another is written anew, as one is
-            of which nothing is said.
+        before: what runs.json says of the tables. A file that is another is written anew.
         played_on: tasks by name as they were then; those that were others are played anew.
 
     Returns:
@@ -141,7 +140,7 @@ def write_references(
                 own = [row for row in there if (row.task, row.policy) == (task.name, policy)]
                 if played_on.get(task.name, task) != task:
                     own = []
-                if not before or [row.episode for row in own] != [*range(episodes)]:
+                if [row.episode for row in own] != [*range(episodes)]:
                     own = _played(task, policy, episodes) or own
                 if damage and not own:
                     raise damage
