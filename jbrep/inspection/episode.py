@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jbrep.coordinates.placing import placed
 from jbrep.encoders.base import BaseEncoder
 from jbrep.inspection.blueprint import episode_layout, series_pages
 from jbrep.inspection.directions import name_directions, send_directions
 from jbrep.inspection.fan import fan_pages, make_fan, send_fan
-from jbrep.inspection.forecast import Examples
+from jbrep.inspection.forecast import Examples, decode
 from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import send_ghost, send_scene
@@ -52,9 +51,8 @@ def record_episode(
         send_terms(recording, task, motion)
     if encoder:
         latent = encoder.encode(rollout.observation)
-        decoded = encoder.decode(latent).astype(np.float64) if encoder.can_decode else None
-        if decoded is not None and encoder.not_decoded:
-            decoded = placed(task, decoded, rollout.observation)
+        seen = rollout.observation
+        decoded = decode(encoder, task, latent, seen) if encoder.can_decode else None
         send_encoding(recording, times, rollout, encoder, latent, decoded)
         if decoded is not None and robot and motion and jitterbug_task(task):
             send_ghost(recording, robot, times, task, motion, decoded)

@@ -113,10 +113,7 @@ class Forecaster:
         """
         if not self._encoder.can_decode:
             return self._read(latent)
-        decoded = self._encoder.decode(latent).astype(np.float64)
-        if self._encoder.not_decoded:
-            decoded = placed(self._task, decoded, observation)
-        return columns(self._task, decoded)
+        return columns(self._task, decode(self._encoder, self._task, latent, observation))
 
     def __call__(
         self, latent: Array, observation: NDArray[Any], actions: NDArray[Any], ahead: int
@@ -136,6 +133,14 @@ class Forecaster:
 def encode(encoder: BaseEncoder, observation: NDArray[np.float32]) -> Array:
     """Codes (n, l) of observations (n, d)."""
     return np.asarray(encoder.encode(observation), np.float64)
+
+
+def decode(
+    encoder: BaseEncoder, task: Task, latent: NDArray[Any], observation: NDArray[Any]
+) -> Array:
+    """Observations (n, d) from codes (n, l); where codes don't tell a place, that of others."""
+    decoded = encoder.decode(latent).astype(np.float64)
+    return placed(task, decoded, observation) if encoder.not_decoded else decoded
 
 
 def columns(task: Task, observation: NDArray[Any]) -> Array:

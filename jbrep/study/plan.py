@@ -182,7 +182,7 @@ class Plan:
             )
 
     def begin(self) -> None:
-        """The same if nothing is there.
+        """Make the folder, and write what the study is if it is new.
 
         Raises:
             InputError: as `check_folder`.

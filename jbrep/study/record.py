@@ -156,8 +156,8 @@ class RunsRecord(Document, frozen=True, kw_only=True):
 
     def draws_of(self, learner: str) -> Mapping[str, tuple[Any, ...]]:
         """The values of settings, one of which each seed of the study draws, of a learner."""
-        is_its_own = self.study is not None and learner in self.study.algorithms
-        return self.study.learner(learner).draws if self.study and is_its_own else {}
+        study = self.study
+        return study.learner(learner).draws if study and learner in study.algorithms else {}
 
     def settings_of(self, run: RunFacts) -> LabelSettings:
         """The settings of a run, without its seed and what depends on it."""
