@@ -30,7 +30,7 @@ ROWS = 250_000  # of which 80 % are trained on; all times are scaled to a millio
 MILLION = 1_000_000
 USUAL_ROWS = 20_000  # that plain PyTorch goes through
 REQUIRED_ONES = {"latent": 8, "features": "velocity_*"}
-PADDED = 32  # numbers of the method that only adds some
+ADDING = {"noise": 32, "ofe": 32}  # latent sizes of the methods that add numbers to the observation
 ROUNDS = 3
 
 
@@ -84,7 +84,7 @@ def usual_epoch(objective: Objective, batches: Iterable[Any], ready: Any) -> Non
 def usual(method: type[Method]) -> Method:
     """The method with its defaults, and what has to be given."""
     given = {name: value for name, value in REQUIRED_ONES.items() if method.takes(name)}
-    return method.of(given | ({"latent": PADDED} if method.name == "noise" else {}))
+    return method.of(given | ({"latent": ADDING[method.name]} if method.name in ADDING else {}))
 
 
 def compare(name: str, method: Learned, data: ScaledDataset) -> None:

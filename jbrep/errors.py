@@ -1,5 +1,6 @@
 """Exceptions for what a user can fix, and words for their messages."""
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, TypeVar
@@ -84,7 +85,7 @@ def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
     """The settings that differ, as text for a message: at most three; empty if none does."""
     differing = list(_differing(there, wanted))
     shown = [
-        "{} {} (now: {})".format(name, *_shown(str(before), str(now)))
+        "{} {} (now: {})".format(name, *_shown(_word(before), _word(now)))
         for name, before, now in differing[:_MOST_SHOWN]
     ]
     more = len(differing) - _MOST_SHOWN
@@ -94,13 +95,34 @@ def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
 def _differing(
     there: Mapping[str, Any], wanted: Mapping[str, Any], where: str = ""
 ) -> Iterator[tuple[str, Any, Any]]:
-    """The settings that differ, of tables the entries that do."""
+    """The settings that differ, of tables the entries that do.
+
+    Lists of tables that have names, such as features, count as tables if the names are alike.
+    """
     for name in {**wanted, **there}:
         before, now = there.get(name), wanted.get(name)
+        if (known := _named(before)) and (given := _named(now)):
+            alike = [*known] == [*given]
+            before, now = (known, given) if alike else ([*known], [*given])
         if isinstance(before, Mapping) and isinstance(now, Mapping):
             yield from _differing(before, now, f"{where}{name}.")
         elif before != now:
             yield f"{where}{name}", before, now
+
+
+def _named(value: Any) -> dict[str, Any]:
+    """A list of tables that have names of their own, as a table of them; of all else none."""
+    if not isinstance(value, list | tuple):
+        return {}
+    tables = {each["name"]: each for each in value if isinstance(each, Mapping) and "name" in each}
+    return tables if len(tables) == len(value) else {}
+
+
+def _word(value: Any) -> str:
+    """A setting as files spell it."""
+    if value is None:
+        return "none"
+    return value if isinstance(value, str) else json.dumps(value, default=str, ensure_ascii=False)
 
 
 def _shown(*texts: str) -> Iterator[str]:

@@ -282,7 +282,7 @@ def test_actions_are_stepped_in_the_32_bits_that_are_stored(tmp_path):
 
 
 def test_arguments_are_settings(sledges, tmp_path):
-    with pytest.raises(InputError, match=r"settings: arguments\.wind None \(now: 0.5\)"):
+    with pytest.raises(InputError, match=r"settings: arguments\.wind none \(now: 0.5\)"):
         collect(some(describe(ID, {"wind": 0.5})), sledges)
     with pytest.raises(InputError, match=r"other settings: max_episode_steps 40 \(now: 9\)"):
         collect(some(describe(ID, max_episode_steps=9)), sledges)

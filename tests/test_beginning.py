@@ -86,7 +86,7 @@ def test_the_policy_is_part_of_what_decides_a_run(source, later, tmp_path):
     assert read_run(later).settings.begin_from == sha256
     assert read_run(source).settings.begin_from is None
     before = (later / RUN).read_bytes()
-    with pytest.raises(InputError, match=rf"holds another run: from {sha256[:37]}\.\.\. \(now: No"):
+    with pytest.raises(InputError, match=rf"holds another run: from {sha256[:37]}\.\.\. \(now: no"):
         train(Run.of(**SETTINGS, seed=1, steps=40), later)
     assert train(Run.of(**SETTINGS, seed=1, steps=40, begin_from=str(source)), later)
     assert (later / RUN).read_bytes() == before

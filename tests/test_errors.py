@@ -24,8 +24,8 @@ def test_at_most_three_settings_are_named_and_long_values_are_cut():
     text = differences(there, wanted)
     assert text == f"a 1 (now: {'x' * 37}...), b 1 (now: 2), c 1 (now: 3), and 2 more"
     assert differences(there, there) == ""
-    assert differences({}, {"a": 1}) == "a None (now: 1)"
-    assert differences({"a": 1}, {}) == "a 1 (now: None)"
+    assert differences({}, {"a": 1}) == "a none (now: 1)"
+    assert differences({"a": 1}, {}) == "a 1 (now: none)"
 
 
 def test_what_differs_is_seen_within_tables_and_long_texts():
@@ -33,3 +33,12 @@ def test_what_differs_is_seen_within_tables_and_long_texts():
     wanted = {"a": {"b": {"c": 1, "d": 4}, "e": 3}, "f": "x" * 50 + "no" + "z" * 50}
     told = f"a.b.d 2 (now: 4), f ...{'x' * 10}yes{'z' * 24}... (now: ...{'x' * 10}no{'z' * 25}...)"
     assert differences(there, wanted) == told
+
+
+def test_of_tables_with_names_the_entries_that_differ_are_named():
+    """In a message Python's spelling of ten features would say nothing."""
+    features = [{"name": "angle", "unit": "rad"}, {"name": "speed", "unit": "m/s"}]
+    changed = [features[0], {**features[1], "unit": None}]
+    assert differences({"f": features}, {"f": changed}) == "f.speed.unit m/s (now: none)"
+    told = 'f ["angle", "speed"] (now: ["speed", "angle"])'
+    assert differences({"f": features}, {"f": features[::-1]}) == told

@@ -221,8 +221,8 @@ def test_the_answer_comes_first_and_nothing_is_judged_that_was_not_registered(pa
     lead = page.locator("#answer .lead").all_inner_texts()
     assert lead[0].startswith("face_direction, sac, final returns: full 798, pca-8 830, dae")
     assert (
-        "; without looking standing still 260, constant drive 247, random 110; hand-written 950. "
-        in lead[0]
+        "; policies that don't look: standing still 260, constant drive 247, random 110; "
+        "hand-written 950. " in lead[0]
     )
     assert lead[0].endswith("Learned: full, pca-8; didn't: dae-8.")
     assert (

@@ -281,7 +281,7 @@ def test_training_and_evaluation_share_the_one_robot(algorithm, drifts, tmp_path
     of_many = (*run[:-2], "--threads", 2, "--set", "num_envs=1", "--preset", "modern")
     told = jbrep(*of_many, "--out", tmp_path / "run")
     assert told.exit_code == 2
-    assert "one_robot True (now: False)" in " ".join(told.output.split())
+    assert "one_robot true (now: false)" in " ".join(told.output.split())
 
 
 def test_what_fails_is_closed_kept_and_tried_again(tmp_path):

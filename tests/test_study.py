@@ -305,7 +305,7 @@ def test_two_workers_of_which_one_is_killed_give_the_same_tables(done, tmp_path)
 
 def test_a_setting_that_is_left_out_now_makes_another_study(tmp_path):
     Plan(TINY.replace(domain={"delay": "0..2"}), tmp_path).write()
-    with pytest.raises(InputError, match=r"another study: domain .* \(now: None\)"):
+    with pytest.raises(InputError, match=r"another study: domain .* \(now: none\)"):
         Plan(TINY, tmp_path).write()
 
 

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from made_up import write_record
 
-from jbrep.dataset import Dataset
+from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.errors import InputError
+from jbrep.methods.registry import METHODS
 from jbrep.records.tables import write_rows
 from jbrep.rl import Run
 from jbrep.rl.files import EPISODES, Episode
 from jbrep.study.tables import Return
+from jbrep.training.method import Learned
 
 ROOT = Path(__file__).parent.parent
 FACE, MOVE = "face_direction", "move_in_direction"
@@ -280,3 +282,16 @@ def test_the_tables_of_the_answer_are_those_on_the_pages(capsys, tmp_path):
     for task, *column in zip(names[1:], *(row[1:] for row in rows), strict=True):
         best = max(means.get((policy, task), 0) for policy in blind)
         assert [int(each) for each in column] == [*(means[each, task] for each in observed), best]
+
+
+def test_the_benchmark_of_methods_takes_each_of_them(monkeypatch):
+    """One that is added may need settings there."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    import methods as benchmark
+
+    data = ScaledDataset(Dataset(ROOT / "data/sample" / FACE))
+    for method in METHODS.values():
+        chosen = benchmark.usual(method)
+        chosen.check_data(data)
+        if isinstance(chosen, Learned):
+            chosen.objective(data)

@@ -52,7 +52,7 @@ def _returns(groups: Sequence[GroupAnalysis]) -> str:
         ]
         for looks in (False, True)
     )
-    for policies, how in ((blind, "without looking "), (written, "")):
+    for policies, how in ((blind, "policies that don't look: "), (written, "")):
         told += f"; {how}{', '.join(policies)}" if policies else ""
     return f"{told}. {_learnt(agents)}"
 

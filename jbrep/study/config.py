@@ -285,6 +285,12 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         """How many times a representation is compared with the baseline."""
         return len(self.tasks) * len(self.algorithms) * (len(self.observed) - 1)
 
+    def flat(self) -> dict[str, Any]:
+        """Its settings, those of each learner under algorithms.NAME, as in its file."""
+        plain = to_plain(self)
+        learners = plain.pop("learners", {})
+        return {**plain, **{f"algorithms.{name}": table for name, table in learners.items()}}
+
     def toml(self) -> str:
         """The file that describes it."""
         given = {

@@ -29,7 +29,6 @@ _GRID = (  # may change
     "algorithms",
     "representations",
     "seeds",
-    "learners",
     "evaluations",
     "title",
 )
@@ -227,14 +226,11 @@ def _differing(there: Study, study: Study) -> str:
 
     A learner that only one of them has is part of its grid.
     """
+    of_one = {f"algorithms.{name}" for name in there.learners.keys() ^ study.learners.keys()}
     before, now = (
-        {name: value for name, value in to_plain(each).items() if name not in _GRID}
+        {name: value for name, value in each.flat().items() if name not in of_one.union(_GRID)}
         for each in (there, study)
     )
-    for name in there.learners.keys() & study.learners.keys():
-        before[f"learner {name}"], now[f"learner {name}"] = (
-            each.learners[name] for each in (there, study)
-        )
     return differences(before, now)
 
 

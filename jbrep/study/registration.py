@@ -64,8 +64,8 @@ class Registration(Document, frozen=True, kw_only=True):
     def differences(self, study: Study) -> str:
         """How a study differs from the registered one, but for its title and added seeds."""
         kept = [seed for seed in study.seeds if seed in self.registered.seeds]
-        known = {**to_plain(study), "seeds": kept, "title": self.registered.title}
-        return differences(to_plain(self.registered), known)
+        now = {**study.flat(), "seeds": kept, "title": self.registered.title}
+        return differences(self.registered.flat(), now)
 
     def deviations(self, study: Study, runs: Collection[RunRecord]) -> list[str]:
         """How what ran differs from what was registered, in sentences.
