@@ -57,7 +57,7 @@ check: docs ## lint, types, import direction, links of the documentation
 
 bench: $(READY) ## speed as ratios in one run, and what the hand-written policies return
 	for each in quick throughput dataset encoders methods learning cohorts wide inspection heuristics environments; do \
-	  MUJOCO_GL=disable $(BIN)/python benchmarks/$$each.py || exit; \
+	  MUJOCO_GL=disable KINETO_LOG_LEVEL=10 $(BIN)/python benchmarks/$$each.py || exit; \
 	done
 
 pictures: $(READY) ## the pictures in docs/, drawn anew
@@ -108,8 +108,7 @@ coordinates coordinates-direction: ## results/coordinates/ and -direction/ anew:
 recipe: ## results/recipe/ anew: half an hour
 figure-7-sac figure-7-td3: ## results/figure-7-sac/ and -td3/ anew: an hour each
 figure-7-ddpg: ## results/figure-7-ddpg/ anew: half an hour
-cart-pole: ## results/cart-pole/ anew: twenty minutes
-cart-pole-plateau: ## results/cart-pole-plateau/ anew: half an hour
+cart-pole: ## results/cart-pole/ anew: half an hour
 cheetah-wide: ## results/cheetah-wide/ anew: forty minutes
 cheetah-plateau: ## results/cheetah-plateau/ anew: five hours
 answer-move-to-position: ## results/answer-move-to-position/ anew: two hours
