@@ -5,6 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 
 _MEMORY = Path("/proc/meminfo")
+_OWN = Path("/proc/self/statm")
 _CGROUP = Path("/sys/fs/cgroup")
 _LIMITS = {  # what a container may use, and uses, in version 2 of control groups and in version 1
     "memory.max": "memory.current",
@@ -36,6 +37,13 @@ def free_memory() -> int:
             if name == "MemAvailable":  # also what only caches files
                 free.append(int(kilobytes.split()[0]) << 10)
     return max(min(free), 0)
+
+
+def memory_of_this() -> int:
+    """Bytes of memory that this process takes; 0 where the system doesn't say."""
+    with suppress(OSError):
+        return int(_OWN.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0
 
 
 def _containers() -> list[tuple[int, int]]:

@@ -102,20 +102,19 @@ def test_what_is_there_already_is_left_alone(copied):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("name", "value", "told"),
     [
-        ("task", "move_to_pose"),
-        ("policy", {"kind": "heuristic"}),
-        ("seed", 4),
-        ("shard_episodes", 2),
-        ("store_state", False),
+        ("task", "move_to_pose", "move_to_pose"),
+        ("policy", {"kind": "heuristic"}, "heuristic"),
+        ("seed", 4, "4"),
+        ("shard_episodes", 2, "2"),
+        ("store_state", False, "false"),
     ],
 )
-def test_other_settings_on_the_same_folder_are_refused_by_name(name, value, copied):
+def test_other_settings_on_the_same_folder_are_refused_by_name(name, value, told, copied):
     before = contents(copied)
     with pytest.raises(InputError, match=f"with other settings: {name}\\S* .* \\(now: ") as refusal:
         collect(settings(**{name: value}), copied)
-    told = value["kind"] if isinstance(value, dict) else str(value)
     assert told in str(refusal.value)
     assert contents(copied) == before
 

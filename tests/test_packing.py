@@ -5,9 +5,12 @@ import os
 import pytest
 from joblib import cpu_count
 
+from jbrep.envs import describe
+from jbrep.envs.instances import memory_of_each
 from jbrep.errors import InputError
 from jbrep.rl import Run, speed
 from jbrep.rl.cohort.replay import memory_of
+from jbrep.study import packing
 from jbrep.study.config import Data, Study
 from jbrep.study.packing import packed, until_done, usual_workers
 from jbrep.study.plan import Plan
@@ -118,3 +121,12 @@ def test_codes_that_are_larger_than_the_observation_have_packs_of_their_own(tmp_
     packs = packs_of(tmp_path, 2, algorithms=("sac-modern",), **codes)
     seen = [{cell.representation.name for cell in pack} for pack in packs]
     assert all(names == {"noise-38"} or "noise-38" not in names for names in seen)
+
+
+def test_robots_take_memory_beside_what_agents_remember(tmp_path, monkeypatch):
+    """64 of dm_control's take four times what an agent remembers of them."""
+    monkeypatch.setattr(packing, "memory", lambda: 8 << 30)
+    cheetah = {"tasks": ("dm_control/cheetah-run-v0",), "algorithms": ("sac-wide",)}
+    packs = packs_of(tmp_path, 2, **cheetah, representations=("full",), seeds=tuple(range(20)))
+    assert 1 <= max(map(len, packs)) <= 4
+    assert memory_of_each(describe("face_direction")) == 0

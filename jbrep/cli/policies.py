@@ -366,7 +366,7 @@ def behaviour(
             each.name,
             interval_of(each.returns),
             *(f"{100 * share:.0f} %" for share in fast_shares(each)),
-            "{:.2f}, {:.2f}".format(*each.mean_place),
+            "{:z.2f}, {:z.2f}".format(*each.mean_place),
         )
         for each in behaviours
     ]

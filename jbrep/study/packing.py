@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.encoders import FULL
+from jbrep.envs.instances import memory_of_each
 from jbrep.envs.names import is_code
 from jbrep.errors import InputError
 from jbrep.machine import cores, memory
@@ -29,7 +30,7 @@ Pack = tuple[Cell, ...]
 # wider cohorts don't cost each of their agents less on a CPU
 _WIDEST = {CPU: 16, CUDA: 64}  # agents; for a GPU not measured yet
 _OVERHEAD = 0.3  # what a step costs besides its agents, in what it costs for each
-_SHARE = 0.7  # of the machine's memory, that replay buffers may take
+_SHARE = 0.7  # of the machine's memory, that replay buffers and environments may take
 _OF_WORKER, _OF_AGENT = 1 << 29, 1 << 25  # bytes that they take besides
 
 
@@ -90,8 +91,10 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
 
 def _most(plan: Plan, cell: Cell, observed: int, workers: int) -> int:
     """How many runs like this one memory holds, for each worker."""
-    of_each = memory_of(plan.run(cell), observed)
-    return int((_SHARE * memory() / workers - _OF_WORKER) // (of_each + _OF_AGENT))
+    run = plan.run(cell)
+    robots = run.learner.hyperparameters.num_envs * memory_of_each(run.task)
+    of_each = memory_of(run, observed) + robots + _OF_AGENT
+    return int((_SHARE * memory() / workers - _OF_WORKER) // of_each)
 
 
 def _observed(plan: Plan, cell: Cell) -> int:
