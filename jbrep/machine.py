@@ -39,7 +39,7 @@ def free_memory() -> int:
     return max(min(free), 0)
 
 
-def memory_of_this() -> int:
+def own_memory() -> int:
     """Bytes of memory that this process takes; 0 where the system doesn't say."""
     with suppress(OSError):
         return int(_OWN.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")

@@ -124,7 +124,7 @@ def test_codes_that_are_larger_than_the_observation_have_packs_of_their_own(tmp_
 
 
 def test_robots_take_memory_beside_what_agents_remember(tmp_path, monkeypatch):
-    """64 of dm_control's take four times what an agent remembers of them."""
+    """64 of dm_control's cheetahs take nearly a gigabyte, more than an agent's replay memory."""
     monkeypatch.setattr(packing, "memory", lambda: 8 << 30)
     cheetah = {"tasks": ("dm_control/cheetah-run-v0",), "algorithms": ("sac-wide",)}
     packs = packs_of(tmp_path, 2, **cheetah, representations=("full",), seeds=tuple(range(20)))

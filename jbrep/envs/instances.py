@@ -21,12 +21,12 @@ from jbrep.envs.origin import files_of
 from jbrep.envs.task import Task
 from jbrep.envs.varied import Varied
 from jbrep.errors import InputError, Notice, kind_and_line
-from jbrep.machine import memory_of_this
+from jbrep.machine import own_memory
 
 Env = gymnasium.Env[Any, Any]
 _Key = tuple[Any, ...]
 _NO_LIMIT = -1  # as gymnasium.make takes it
-_MEASURED = 3  # environments whose memory is
+_MEASURED = 3  # environments, to see what memory each takes
 
 
 class _Instance(NamedTuple):
@@ -114,7 +114,7 @@ def memory_of_each(task: Task) -> int:
     with suppress(InputError):
         for _ in range(1 + _MEASURED):  # with the first one, modules are loaded
             used.append(take(task.id, task.arguments, task.max_episode_steps))
-            taken.append(memory_of_this())
+            taken.append(own_memory())
     for env in used:
         give_back(env)
     return max(0, taken[-1] - taken[0]) // _MEASURED if len(taken) > _MEASURED else 0

@@ -2,8 +2,9 @@
 
 import heapq
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -65,11 +66,12 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
             groups[*cell.kind, observed[seen]].append(cell)
         else:
             alone.append((cell,))
-    widest = _WIDEST[plan.device]
-    limits = (_most(plan, group[0], size, workers) for (_, _, size), group in groups.items())
+    robot = cache(lambda task: memory_of_each(plan.task(task)))  # measured once for each task
+    widest, most_of = _WIDEST[plan.device], partial(_most, plan, workers, robot)
+    limits = (most_of(group[0], size) for (_, _, size), group in groups.items())
     most = min(limits, default=width or widest)
     of_alone = [
-        _most(plan, cell, _observed(plan, cell), workers)
+        most_of(cell, _observed(plan, cell))
         for cell in {cell.kind: cell for (cell,) in alone}.values()
         if is_off_policy(cell.learner.algorithm)
     ]
@@ -89,10 +91,10 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
     return sorted(best, key=lambda pack: (-len(pack), place[pack[0].name]))
 
 
-def _most(plan: Plan, cell: Cell, observed: int, workers: int) -> int:
-    """How many runs like this one memory holds, for each worker."""
+def _most(plan: Plan, workers: int, robot: Callable[[str], int], cell: Cell, observed: int) -> int:
+    """How many runs like this one memory holds, for each worker, where a robot takes so much."""
     run = plan.run(cell)
-    robots = run.learner.hyperparameters.num_envs * memory_of_each(run.task)
+    robots = run.learner.hyperparameters.num_envs * robot(cell.task)
     of_each = memory_of(run, observed) + robots + _OF_AGENT
     return int((_SHARE * memory() / workers - _OF_WORKER) // of_each)
 
