@@ -101,6 +101,8 @@ class Dataset:
         self.task = self.manifest.task
         self._checked: set[Checked] = set()
         self._opened = lru_cache(_open_at_once())(self._open)
+        shards = range(len(self.manifest.shards))
+        self._paths = [self.folder / shard_name(k) for k in shards]  # looked at for every chunk
         self._ends = list(accumulate(entry.rows for entry in self.manifest.shards))
         self._specs = self.manifest.settings.step_specs()
 
@@ -220,7 +222,7 @@ class Dataset:
 
     def _shard(self, shard: int) -> Columns:
         """A shard as it is on disk now: another state of its file is another entry of the cache."""
-        return self._opened(shard, file_state(self.folder / shard_name(shard)))
+        return self._opened(shard, file_state(self._paths[shard]))
 
     def _open(self, shard: int, state: FileState) -> Columns:
         try:
