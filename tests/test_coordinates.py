@@ -10,6 +10,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from jbrep.coordinates import INGREDIENTS, Coordinates, make_coordinates
 from jbrep.coordinates.coordinates import Part
+from jbrep.coordinates.formulas import FORMULAS
 from jbrep.coordinates.invariance import check_invariant
 from jbrep.coordinates.nearest import continuous, nearest
 from jbrep.coordinates.placing import placed
@@ -58,6 +59,16 @@ def test_coordinates_lose_nothing(name, system):
     made, rows = make_coordinates(task, system), states(TASKS[name].plain)
     assert not made.not_decoded
     np.testing.assert_allclose(made.inverse(made.forward(rows)), rows, atol=2e-4)
+
+
+@pytest.mark.parametrize("near", [0, 1e-9, 1e-3])
+def test_a_robot_on_its_back_stays_there(near):
+    about, w, z = np.random.default_rng(0).uniform(-1, 1, (3, 200))
+    columns = [near * w, np.cos(np.pi * about), np.sin(np.pi * about), near * z]
+    for name in ("tilt", "attitude"):
+        formula, up = FORMULAS[name], FORMULAS["tilt"].forward
+        decoded = formula.inverse(np, formula.forward(np, columns, 0), 0)
+        np.testing.assert_allclose(up(np, decoded, 0), up(np, columns, 0), atol=0.05)
 
 
 @pytest.mark.parametrize("system", ["coordinates", "symmetry"])

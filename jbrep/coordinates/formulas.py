@@ -62,11 +62,13 @@ def _attitude(library: Any, columns: Columns, soft: float) -> Columns:
 def _quaternion(library: Any, columns: Columns, soft: float) -> Columns:
     """The unit quaternion of a tilt and a heading, w not negative."""
     up_x, up_y, up_z, cosine, sine = columns
-    share = abs(1 + up_z) / 2 + _UPSIDE_DOWN  # w^2 + z^2
+    share = abs(1 + up_z) / 2  # w^2 + z^2
     half = library.arctan2(sine, cosine) / 2
-    root = library.sqrt(share)
+    root = library.sqrt(share + _UPSIDE_DOWN**2)
     w, z = root * library.cos(half), root * library.sin(half)
-    x, y = (z * up_x + w * up_y) / (2 * share), (z * up_y - w * up_x) / (2 * share)
+    share = share + _UPSIDE_DOWN
+    half_turn = 1e-4 * (_UPSIDE_DOWN / share) ** 2  # about x, if exactly upside down
+    x, y = (z * up_x + w * up_y) / (2 * share) + half_turn, (z * up_y - w * up_x) / (2 * share)
     norm = library.sqrt(w * w + x * x + y * y + z * z)
     return [w / norm, x / norm, y / norm, z / norm]
 
