@@ -67,7 +67,8 @@ def _quaternion(library: Any, columns: Columns, soft: float) -> Columns:
     root = library.sqrt(share + _UPSIDE_DOWN**2)
     w, z = root * library.cos(half), root * library.sin(half)
     share = share + _UPSIDE_DOWN
-    half_turn = 1e-4 * (_UPSIDE_DOWN / share) ** 2  # about x, if exactly upside down
+    near = _UPSIDE_DOWN / share
+    half_turn = 1e-4 * near * near  # about x, if exactly upside down
     x, y = (z * up_x + w * up_y) / (2 * share) + half_turn, (z * up_y - w * up_x) / (2 * share)
     norm = library.sqrt(w * w + x * x + y * y + z * z)
     return [w / norm, x / norm, y / norm, z / norm]

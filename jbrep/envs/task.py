@@ -441,24 +441,24 @@ def check_same(expected: Task, actual: Task, what: str) -> None:
             f"{expected.name}"
         )
     if actual.feature_names != expected.feature_names:
-        mine = [name for name in actual.feature_names if name not in expected.feature_names]
-        here = [name for name in expected.feature_names if name not in actual.feature_names]
-        told = (
-            f", such as {mine[0]}, which isn't here"
-            if mine
-            else f", without {here[0]}"
-            if here
-            else ", in another order"
-        )
         raise InputError(
-            f"{what} was made for other features of {actual.name}{told}: give the same --hide, "
-            "--history and --features"
+            f"{what} was made for other features of {actual.name}, "
+            f"{_other_features(expected.feature_names, actual.feature_names)}: give the same "
+            "--hide, --history and --features"
         )
     if (actual.offsets or {}) != (expected.offsets or {}):
         raise InputError(
             f"{what} was made for features of {actual.name} with other offsets: give those in "
             "--features"
         )
+
+
+def _other_features(expected: Sequence[str], actual: Sequence[str]) -> str:
+    if unknown := [name for name in actual if name not in expected]:
+        return f"such as {unknown[0]}, which isn't here"
+    if missing := [name for name in expected if name not in actual]:
+        return f"without {missing[0]}"
+    return "in another order"
 
 
 def changed_parts(there: Task, now: Task) -> str:
