@@ -73,7 +73,7 @@ class Coordinates:
     """A fixed map from a task's observations to other numbers, and the way back if there is one.
 
     Observations and coordinates are NumPy arrays or torch tensors, with the numbers along the last
-    axis. None of the formulas jumps, except where a body stands on its head.
+    axis. None of the formulas jumps; of a body that stands on its head the heading is lost.
 
     Args:
         task: whose observations they are calculated from.

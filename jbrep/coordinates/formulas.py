@@ -1,6 +1,7 @@
 """The formulas of coordinates, column by column: for NumPy, torch and whatever else calculates.
 
-Each takes the library (of sin, cos, sqrt and arctan2) and a list of columns, and gives columns.
+Each takes the library (of sin, cos, sqrt, arctan2 and where) and a list of columns, and gives
+columns.
 Quaternions are (w, x, y, z) and turn vectors of the body into the world.
 """
 
@@ -8,7 +9,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 Columns = list[Any]
-_UPSIDE_DOWN = 1e-6  # of w^2 + z^2, below which a tilt says nothing of a heading
+_NO_LENGTH = 1e-6  # of a length squared, below which a direction says nothing
+_NOTHING = 1e-18  # beside w^2 + z^2 in single precision, unless a robot is upside down
 
 
 class Formula(NamedTuple):
@@ -62,14 +64,15 @@ def _attitude(library: Any, columns: Columns, soft: float) -> Columns:
 def _quaternion(library: Any, columns: Columns, soft: float) -> Columns:
     """The unit quaternion of a tilt and a heading, w not negative."""
     up_x, up_y, up_z, cosine, sine = columns
-    share = abs(1 + up_z) / 2  # w^2 + z^2
+    more = 1 + abs(up_z)  # 1 - |up_z|, which is small, would be that of the last digits
+    flat = (up_x * up_x + up_y * up_y) / more
+    share = library.where(up_z < 0, flat, more) / 2 + _NOTHING  # w^2 + z^2
     half = library.arctan2(sine, cosine) / 2
-    root = library.sqrt(share + _UPSIDE_DOWN**2)
+    root = library.sqrt(share)
     w, z = root * library.cos(half), root * library.sin(half)
-    share = share + _UPSIDE_DOWN
-    near = _UPSIDE_DOWN / share
-    half_turn = 1e-4 * near * near  # about x, if exactly upside down
-    x, y = (z * up_x + w * up_y) / (2 * share) + half_turn, (z * up_y - w * up_x) / (2 * share)
+    half_turn = 2 * _NOTHING  # about x, exactly upside down
+    x = (z * up_x + w * up_y + half_turn) / (2 * share)
+    y = (z * up_y - w * up_x) / (2 * share)
     norm = library.sqrt(w * w + x * x + y * y + z * z)
     return [w / norm, x / norm, y / norm, z / norm]
 
@@ -111,7 +114,7 @@ def _turned(library: Any, columns: Columns, soft: float) -> Columns:
 
 def _turned_back(library: Any, columns: Columns, soft: float) -> Columns:
     x, y, cosine, sine = columns
-    size = cosine * cosine + sine * sine + _UPSIDE_DOWN
+    size = cosine * cosine + sine * sine + _NO_LENGTH
     return [(x * cosine - y * sine) / size, (y * cosine + x * sine) / size]
 
 
