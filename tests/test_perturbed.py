@@ -14,7 +14,7 @@ from jbrep.envs import Lanes, describe
 from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.domain import Domain, Draws, read_ranges
 from jbrep.envs.randomized import with_domain
-from jbrep.envs.varied import put_factors, velocity_after
+from jbrep.envs.varied import can_be_pushed, put_factors, velocity_after
 from jbrep.envs.view import with_view
 from jbrep.play.jitterbug import turn_targets
 from jbrep.play.perturbed import domains_of
@@ -103,6 +103,19 @@ def test_the_same_seed_gives_the_same_bytes_whatever_is_beside_it(name, given, m
     assert_same(whole, tape(task, SEEDS[1:2]), [1])
     assert_same(whole, tape(task, broken_at=5))
     assert_same(whole, tape(task))  # in instances that have played other episodes
+
+
+@pytest.mark.parametrize("given", [{"friction": 0.5}, {"mass": 2}, {"push": 2}], ids=str)
+@pytest.mark.parametrize("name", ["face_direction", "Hopper-v5"])
+def test_each_change_of_physics_is_felt(name, given, monkeypatch):
+    monkeypatch.setattr("jbrep.envs.domain._PUSHES", 0.3)
+    changed = tape(with_domain(TASKS[name], given))[0]
+    assert not (changed == tape(TASKS[name])[0]).all(axis=(0, 2)).any()
+
+
+def test_a_drawn_body_is_the_body_of_that_number():
+    drawn = with_domain(TASKS["face_direction"], {"body": 3})
+    assert_same(tape(drawn), tape(describe("face_direction", {"body": 3}, 12)))
 
 
 @pytest.mark.parametrize("name", ["face_direction", "Pendulum-v1"])
@@ -199,6 +212,23 @@ def test_a_push_gives_the_whole_robot_its_velocity():
     assert np.abs(added[-1]) > 0.01  # the leg swings
 
 
+@pytest.mark.parametrize(
+    ("link", "moves"),
+    [
+        ('axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"', True),
+        ('axis="0 1 0"/><geom type="capsule" fromto="-.3 0 0 .3 0 0" size=".02"', False),
+    ],
+)
+def test_a_push_on_a_robot_that_is_held_is_on_what_moves(link, moves):
+    """Unless that turns about its own centre of mass."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><geom size=".1" mass="5"/><body pos="0 0 .2">'
+        f"<joint {link}/></body></body></worldbody></mujoco>"
+    )
+    added = velocity_after(model, np.full(1, np.pi / 2), np.array([1, 0, 0]), mujoco.MjData(model))
+    assert can_be_pushed(model) == (np.abs(added).max() > 1) == moves
+
+
 def test_factors_are_of_the_model_s_friction_and_masses():
     usual, varied = (mujoco.MjModel.from_xml_string(LEGGED) for _ in range(2))
     data = mujoco.MjData(usual)
@@ -250,7 +280,11 @@ def test_the_command_shows_what_a_policy_keeps(tmp_path):
     rows = json.loads(file.read_text())["rows"]
     assert [row["name"] for row in rows][-2:] == ["push=0.1", "push=0.3"]
     assert rows[0]["returns"] == json.loads(jbrep(*played, "--json").output)["returns"]
+    usual = np.mean(rows[0]["returns"])
+    shares = [row["share"][0] for row in rows]
+    assert shares == pytest.approx([np.mean(row["returns"]) / usual for row in rows])
     assert rows[0]["share"] == [1, 1, 1]
+    assert len(set(shares)) > 3
     one = json.loads(jbrep(*played, "--perturb", "delay=2", "--json").output)["rows"]
     assert [row["name"] for row in one] == ["undisturbed", "delay=2"]
     assert one[1] == next(row for row in rows if row["name"] == "delay=2")

@@ -14,6 +14,7 @@ from jbrep.envs.make import creator, is_batched
 from jbrep.envs.mujoco import physics_of
 from jbrep.envs.names import spec_of
 from jbrep.envs.task import Task
+from jbrep.envs.varied import can_be_pushed
 from jbrep.errors import InputError
 from jbrep.records.record import from_plain, to_plain
 
@@ -39,12 +40,14 @@ def with_domain(task: Task, given: Mapping[str, Any]) -> Task:
 
 
 def changeable(task: Task) -> tuple[str, ...]:
-    """What of an environment a domain may have: all with MuJoCo have friction, mass and pushes."""
+    """What of an environment a domain may have: with MuJoCo friction, mass and, mostly, pushes."""
     if is_batched(task):
         own = getattr(creator(spec_of(task), vector=True), "changeable", ())
         return (*SIGNALS, *own)
     env = instances.take(task.id, task.arguments, task.max_episode_steps)
-    own = PHYSICS if physics_of(env) else ()
+    physics = physics_of(env)
+    can_push = physics and can_be_pushed(physics.model)
+    own = [name for name in PHYSICS if name != "push" or can_push] if physics else []
     instances.give_back(env)
     return (*SIGNALS, *own)
 

@@ -40,17 +40,30 @@ def velocity_after(
     Args:
         model: of the robot.
         qpos: where it is, (nq,).
-        push: on the root body's centre of mass, (3,): the impulse by the mass of the robot [m/s].
+        push: on the centre of mass of the body that carries all others that move, (3,): the
+            impulse by the mass of these [m/s].
         data: as for `put_factors`.
     """
-    root, force = root_of(model), np.zeros(model.nv)
+    can_move = (model.body_rootid == root_of(model)) & (model.body_weldid > 0)
+    first = int(np.argmax(can_move * model.body_subtreemass))
+    force = np.zeros(model.nv)
     data.qpos[:] = qpos
     mujoco.mj_fwdPosition(model, data)
-    impulse = model.body_subtreemass[root] * push
-    mujoco.mj_applyFT(model, data, impulse, np.zeros(3), data.xipos[root], root, force)
+    impulse = model.body_subtreemass[first] * push
+    mujoco.mj_applyFT(model, data, impulse, np.zeros(3), data.xipos[first], first, force)
     velocity = np.zeros((1, model.nv))
     mujoco.mj_solveM(model, data, velocity, force[None])
     return velocity[0]
+
+
+def can_be_pushed(model: mujoco.MjModel) -> bool:
+    """Whether a push from some side moves a robot, in its first posture or in another one."""
+    data, sides, bent = mujoco.MjData(model), np.eye(3)[:2], model.qpos0.copy()
+    mujoco.mj_integratePos(model, bent, np.ones(model.nv), 1)  # each joint by 1 rad or 1 m
+    moved = [
+        velocity_after(model, qpos, side, data) for qpos in (model.qpos0, bent) for side in sides
+    ]
+    return bool(np.abs(moved).max(initial=0) > 1e-6)
 
 
 class Varied(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -34,7 +34,7 @@ class Row(Record, frozen=True, kw_only=True):
     percentile_10: Finite
     percentile_90: Finite
     # the mean return as a share of the undisturbed one, with its 95 % interval over episodes; null
-    # where that has a return below 0, so that there are no shares
+    # where one of either is below 0, so that there are no shares
     share: tuple[Finite | None, Finite | None, Finite | None] | None
 
     @property
@@ -129,7 +129,7 @@ def perturb(
         returns = player._replace(task=task).returns(episodes, threads, retries)
         first = returns if first is None else first
         share = None
-        if first.min() >= 0 and first.max() > 0:
+        if min(first.min(), returns.min()) >= 0 and first.max() > 0:
             share = bootstrap(lambda own, usual: own / usual, returns, first)
         yield Row(
             name=name,
