@@ -68,7 +68,7 @@ def episodes_of(folder):
     [*((HOPPER, each) for each in CLASSES), (PENDULUM, "a2c"), (PENDULUM, "sac")],
     ids=lambda given: getattr(given, "slug", given),
 )
-def test_every_algorithm_learns_on_any_task(algorithm, task, short_rollouts, tmp_path):
+def test_every_algorithm_changes_its_weights_on_any_task(algorithm, task, short_rollouts, tmp_path):
     run = Run.of(task=task, algorithm=algorithm, steps=150, preset="paper", **ONE_EACH)
     result = train(run, tmp_path)
     assert result.status == "finished", result.reason
@@ -222,10 +222,12 @@ def test_arguments_and_time_limit_are_settings_of_a_run(tmp_path):
         ("sac", {"learning_starts": 50}),
         ("a2c", {"use_sde": True}),
         ("tqc", {"learning_starts": 50, "use_sde": True}),
+        ("a2c", {"num_envs": 1}),  # one robot, whose episodes last 40 steps
     ],
 )
 def test_a_run_goes_on_as_one_that_had_more_steps_at_first(algorithm, overrides, tmp_path):
     settings = {"algorithm": algorithm, "preset": "modern", "overrides": overrides}
+    settings["one_robot"] = "num_envs" in overrides
     settings |= {"evaluate_every": 80, "evaluation_episodes": 2, "final_episodes": 3}
     shorter, longer = (Run.of(CART, steps=steps, **settings) for steps in (160, 320))
     grown, whole = tmp_path / "grown", tmp_path / "whole"

@@ -145,6 +145,9 @@ def test_settings_reach_the_agent():
         ("sac", {"ent_coef": "often"}, "stable-baselines3 can't make sac .* 'often'"),
         ("sac", {"train_freq": [1, "episode"], "num_envs": 2}, "a num_envs of 1"),
         ("tqc", {"top_quantiles_to_drop_per_net": 25}, "must be below n_quantiles, 25"),
+        ("tqc", {"n_quantiles": 2}, "top_quantiles_to_drop_per_net is 2: .* below n_quantiles, 2"),
+        ("sac", {"gradient_steps": 0}, "gradient_steps is 0, with which nothing is learned"),
+        ("sac", {"target_update_interval": 9}, "is 9: it counts .* at most gradient_steps, 1"),
     ],
 )
 def test_what_a_setting_can_not_be(algorithm, settings, message, tmp_path):

@@ -251,10 +251,11 @@ class Job:
             episode_ended: whether an episode of training has just ended.
             keep_checkpoint: as for `RunSettings.is_evaluation_due`.
         """
-        every, last = self.settings.evaluate_every, self.history.evaluations[-1].step
         if not self.run.one_robot:
             return self.settings.is_evaluation_due(step, keep_checkpoint)
-        return episode_ended and step < self.settings.steps and step // every > last // every
+        every, last = self.settings.evaluate_every, self.history.evaluations[-1].step
+        is_final = step >= self.settings.steps and not keep_checkpoint
+        return episode_ended and not is_final and step // every > last // every
 
     def close(self) -> None:
         """Free what the evaluations hold."""

@@ -6,7 +6,7 @@ import typing
 import warnings
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -18,7 +18,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from jbrep.errors import InputError
 from jbrep.records.record import converted, shown, to_plain
 from jbrep.rl.agent import ACTIVATIONS, Spaces, global_random_state_kept, make_agent, one_line
-from jbrep.rl.presets import Hyperparameters, NetArch, get_preset, parameters_of, sb3_class
+from jbrep.rl.presets import (
+    Hyperparameters,
+    NetArch,
+    argument,
+    get_preset,
+    parameters_of,
+    sb3_class,
+)
 
 _MOST = 10**9  # of any number
 _ANY_SPACES = (spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-1, 1, (1,), np.float32))
@@ -97,7 +104,7 @@ def _overridden(algorithm: str, preset: str, text: str) -> Hyperparameters:
     for name, value in json.loads(text).items():
         _check_name(algorithm, name)
         result = _changed(result, algorithm, name, value)
-    _check_together(result)
+    _check_together(algorithm, result)
     _build(algorithm, result)
     return result
 
@@ -228,12 +235,24 @@ def _allowed(name: str, annotation: Any) -> Any:
     return typing.Union[tuple(options)]  # noqa: UP007 - of a list
 
 
-def _check_together(chosen: Hyperparameters) -> None:
-    """Check what stable-baselines3 would only find out in training."""
-    frequency = chosen.algorithm_kwargs.get("train_freq")
+def _check_together(algorithm: str, chosen: Hyperparameters) -> None:
+    """Check what stable-baselines3 would only find out in training, or never."""
+    given = partial(argument, algorithm, chosen)
+    frequency, steps = given("train_freq"), given("gradient_steps")
     if isinstance(frequency, list) and frequency[1] == "episode" and chosen.num_envs > 1:
         raise InputError("train_freq counts episodes: that needs a num_envs of 1")
-    dropped = chosen.algorithm_kwargs.get("top_quantiles_to_drop_per_net", 0)
+    if steps == 0:
+        raise InputError(
+            "gradient_steps is 0, with which nothing is learned: it must be above, or -1 for as "
+            "many as there were steps"
+        )
+    every = given("target_update_interval")
+    if every and steps and 1 <= steps < every:
+        raise InputError(
+            f"target_update_interval is {every}: it counts the gradient steps of a rollout, "
+            f"so it must be at most gradient_steps, {steps}"
+        )
+    dropped = given("top_quantiles_to_drop_per_net")
     if dropped and dropped >= (most := chosen.policy_kwargs.get("n_quantiles", 25)):
         raise InputError(
             f"top_quantiles_to_drop_per_net is {dropped}: it must be below n_quantiles, {most}"

@@ -218,3 +218,9 @@ def parameters_of(algorithm: str) -> tuple[Mapping[str, Parameter], Mapping[str,
     """What stable-baselines3's class of an algorithm takes, and what that of its policy does."""
     kind = sb3_class(algorithm)
     return signature(kind).parameters, signature(kind.policy_aliases["MlpPolicy"]).parameters
+
+
+def argument(algorithm: str, chosen: Hyperparameters, name: str) -> Any:
+    """What an algorithm's class gets by that name, if only by default; None if it takes none."""
+    usual, _ = parameters_of(algorithm)
+    return chosen.algorithm_kwargs.get(name, usual[name].default) if name in usual else None

@@ -28,7 +28,7 @@ from jbrep.rl.job import Job
 from jbrep.rl.noise import Memory, Noise, beginning
 from jbrep.rl.normalization import normalized
 from jbrep.rl.overrides import without_buffer
-from jbrep.rl.presets import parameters_of
+from jbrep.rl.presets import argument
 
 Indices = NDArray[np.int64]
 _LOG_EVERY = 4  # episodes, as in stable-baselines3
@@ -59,8 +59,7 @@ class Member:
         env = DummyVecEnv([lambda: Spaces(*agent_spaces(run.task, job.encoder))])
         normalizing = normalized(env) if chosen.normalize else env
         self.agent: Any = make_agent(settings.algorithm, small, normalizing, run.seed)
-        usual, _ = parameters_of(settings.algorithm)
-        size = chosen.algorithm_kwargs.get("buffer_size", usual["buffer_size"].default)
+        size = argument(settings.algorithm, chosen, "buffer_size")
         vars(self.agent)["buffer_size"] = size  # of policy.zip, which others may go on with
         self._normalizer: VecNormalize | None = self.agent.get_vec_normalize_env()
         steps = settings.episode_steps

@@ -7,17 +7,15 @@ from numpy.typing import NDArray
 
 from jbrep.encoders.base import Float32
 from jbrep.envs.lanes import Flags
-from jbrep.rl.presets import parameters_of
+from jbrep.rl.presets import argument
 from jbrep.rl.run import Run
 
 
 def capacity_of(run: Run) -> int:
     """The most transitions that a run keeps: no more than it makes, in whole rollouts."""
     chosen = run.learner.hyperparameters
-    usual, _ = parameters_of(run.learner.algorithm)
     size, every = (
-        chosen.algorithm_kwargs.get(name, usual[name].default)
-        for name in ("buffer_size", "train_freq")
+        argument(run.learner.algorithm, chosen, name) for name in ("buffer_size", "train_freq")
     )
     count, unit = (every, "step") if isinstance(every, int) else every
     steps = count * (chosen.agent_steps(run.task.max_episode_steps) if unit == "episode" else 1)
