@@ -33,6 +33,13 @@ def quick_figures():
         yield
 
 
+@pytest.fixture(autouse=True)
+def same_numbers(request):
+    """A module's RANDOM gives a test the same numbers, whichever ran before it."""
+    if hasattr(request.module, "RANDOM"):
+        request.module.RANDOM = np.random.default_rng(0)
+
+
 @pytest.fixture
 def one_figure(monkeypatch):
     """Reports with their first figure alone: drawing all takes most of their time."""

@@ -103,7 +103,7 @@ def test_gradients_flow_after_a_first_use_without_them(on):
     encoder = make() if on is None else find("symmetry", TASK).with_header(name="anew")
     with torch.inference_mode():
         encoder.encode(torch.from_numpy(observations(2)))
-    rows = torch.from_numpy(observations(2)).requires_grad_()
+    rows = torch.from_numpy(observations(20)).requires_grad_()
     encoder.encode(rows).sum().backward()
     assert rows.grad.any()
 

@@ -290,7 +290,7 @@ def test_constant_huge_and_tiny_features_give_finite_encoders(kind, tmp_path):
     back = (encoder.decode(encoder(rows)) - rows) / data.scaler.half_width
     assert encoder.header.metrics["held_out_mse"] == pytest.approx(np.mean(back**2), rel=1e-3)
     assert np.abs(back).max() < 4
-    if kind == "identity":  # what is constant is scaled to 0
+    if kind == "full":  # what is constant is scaled to 0
         assert not encoder(rows)[:, 0].any()
         assert not back[:, 0].any()
     assert encoder.task.name == "Humanoid-v5"

@@ -193,10 +193,12 @@ def test_a_registration_without_a_study_is_refused(registered, tmp_path):
         read_registration(tmp_path)
 
 
-@pytest.mark.parametrize("path", sorted(Path("results").glob(f"*/{REGISTRATION}")), ids=str)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "results").glob(f"*/{REGISTRATION}")), ids=lambda p: p.parent.name
+)
 def test_the_committed_results_are_of_the_studies_that_were_registered(path):
     registration = read_registration(path.parent)
-    study = read_study(Path("studies") / f"{path.parent.name}.toml")
+    study = read_study(ROOT / "studies" / f"{path.parent.name}.toml")
     assert not registration.differences(study)
     record = read_document(path.with_name(RECORD), RunsRecord)
     assert record.registration.sha256 == registration.sha256

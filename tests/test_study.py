@@ -53,6 +53,7 @@ from jbrep.study.runner import Progress, on_this_machine, run_study
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS, read_references, write_references
 from jbrep.study.work import PROGRESS, Outcome, work
 
+ROOT = Path(__file__).parent.parent
 TINY = Study(
     tasks=("face_direction",),
     algorithms=("a2c",),
@@ -91,7 +92,7 @@ def done(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "path", sorted(Path("studies").rglob("*.toml")), ids=lambda path: path.stem
+    "path", sorted((ROOT / "studies").rglob("*.toml")), ids=lambda path: path.stem
 )
 def test_the_studies_that_come_along_are_studies(path, tmp_path):
     study = read_study(path)
@@ -298,7 +299,7 @@ def test_two_workers_of_which_one_is_killed_give_the_same_tables(done, tmp_path)
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
     assert run_study(plan, on_this_machine, 2) == 0
-    killer.join()
+    killer.join(60)
     assert killed
     assert tables(plan.folder) == tables(done.folder)
 

@@ -22,7 +22,7 @@ from jbrep.play.sources import find_good_policy
 from jbrep.records.document import read_document
 from jbrep.records.lock import exclusive
 from jbrep.report.evaluation import evaluation_text
-from jbrep.report.worth import condition
+from jbrep.report.worth import condition, conditioning
 from jbrep.rl.files import read_evaluations
 from jbrep.rl.trainers import train_jobs
 from jbrep.worth import add_worth, learned
@@ -148,11 +148,12 @@ def test_an_agent_whose_environment_fails_ends_alone(data, tmp_path, monkeypatch
         learned({"full": codes["full"]}, data.task, tmp_path)
 
 
-def returns_of(told, full, pca):
+def returns_of(told, full, pca, half=5):
     """The evaluation, with other returns."""
     evaluation = known(told)
     returns = {
-        label: Score(mean, mean - 5, mean + 5) for label, mean in (("full", full), ("pca-8", pca))
+        label: Score(mean, mean - half, mean + half)
+        for label, mean in (("full", full), ("pca-8", pca))
     }
     references = {"standing still": 30.0}
     found = Worth(runs=2, steps=100, episodes=20, returns=returns, references=references)
@@ -168,7 +169,10 @@ def returns_of(told, full, pca):
     ("returns", "first", "line"),
     [
         ((90, 88), "Take pca-8: by small agents, the smallest of those", "88 [83, 93]"),
+        ((90, 84), "Take pca-8: by small agents, the smallest of those", "84 [79, 89]"),
         ((90, 82), "Take the full observation: by small agents", "82 [77, 87]"),
+        ((33, 20), "Nothing can be said of the codes: by small agents, none", "20 [15, 25]"),
+        ((33, 20, 2), "Take the full observation: by small agents", "20 [18, 22]"),
         ((82, 90), "Take pca-8: by small agents, it is worth the most.", "90 [85, 95]"),
         ((25, 20), "Nothing can be said of the codes: by small agents, none", "20"),
     ],
@@ -188,6 +192,9 @@ def test_a_code_that_hardly_varies_in_a_direction_is_ill_conditioned(told):
     few = units.replace(
         variance=tuple(mixed.var(axis=0).tolist()), correlation=correlation, dead=()
     )
+    assert conditioning(few).startswith("ill-conditioned: one direction varies ")
+    apart = few.replace(variance=(1.0, 4.0, 2.0), correlation=tuple(map(tuple, np.eye(3).tolist())))
+    assert conditioning(apart) == ""
     assert condition(few) == pytest.approx(np.linalg.cond(np.cov(mixed.T)) ** 0.5, rel=1e-3)
     with_dead = few.replace(
         variance=(*few.variance, 0.0),
