@@ -9,7 +9,7 @@ support anything; --failing 0.34 is a limit at which eight can.
 
 import argparse
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
@@ -77,6 +77,7 @@ TRUTHS = {
     "skewed, a tenth of the gain less": Truth(skewed(880), skewed(ON_MARGIN), LESS),
     "a fifth fails on both": Truth(failing(0.2), failing(0.2), EQUAL),
     "a fifth fails on less state": Truth(normal(880), failing(0.2), WORSE),
+    "a ninth fails on less state": Truth(normal(880), failing(0.11), WORSE),
     "all fail on less state": Truth(normal(880), failing(1), WORSE),
     "all fail on both": Truth(failing(1), failing(1), (BOTH,) * 4),
 }
@@ -114,10 +115,10 @@ def judged(name: str, runs: int, failing: float, seed: int) -> tuple[str, ...]:
     return tuple(verdict.verdict for verdict in found[TASK, ALGORITHM][OTHER])
 
 
-def main(studies: int, failing: float) -> None:
+def main(studies: int, failing: float, sizes: Sequence[int]) -> None:
     rows = []
     with ProcessPoolExecutor() as pool:
-        for name, runs in Progress([(name, n) for name in TRUTHS for n in RUNS], unit="case"):
+        for name, runs in Progress([(name, n) for name in TRUTHS for n in sizes], unit="case"):
             found = [*pool.map(partial(judged, name, runs, failing), range(studies), chunksize=8)]
             cells = []
             for each, wrong in zip(zip(*found, strict=True), TRUTHS[name].wrong, strict=True):
@@ -133,5 +134,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--studies", type=int, default=400)
     parser.add_argument("--failing", type=float, default=Rules().failing)
+    parser.add_argument("--runs", type=int, nargs="+", default=RUNS)
     arguments = parser.parse_args()
-    main(arguments.studies, arguments.failing)
+    main(arguments.studies, arguments.failing, arguments.runs)

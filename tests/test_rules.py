@@ -466,9 +466,17 @@ def test_where_runs_are_cut_returns_are_held_to_what_those_starts_return():
     assert (frame.reference, frame.half) == (250, 550)
     few, many = runs[0].returns.shape[1], len(facts["final"])
     played = {KEY[0]: {"standing still": [250.0] * few + [0.0] * (many - few)}}
+    played[KEY[0]]["random"] = [0.0] * few + [250.0] * (many - few)  # what gains count over
     (group,) = analyse(runs + longer, references=played).groups
     assert group.cut
+    assert group.reference_policy == "random"
     assert (group.reference, group.blind.value) == (250, 250)
+
+
+def test_agents_that_stay_as_they_were_do_not_learn_by_beginning_elsewhere():
+    nothing = {"return_floor": None, "reference": None, "final": np.full(20, 700.0)}
+    (group,) = analyse([curve(250, seed=seed, **nothing) for seed in range(5)]).groups
+    assert group.labels[0].learnt == "no"
 
 
 def test_a_failed_run_is_as_bad_as_the_worst_start_of_all():

@@ -146,12 +146,14 @@ def test_a_study_from_toml(tmp_path):
         ("seeds = true", "seeds is True: it must be a list of whole numbers"),
         ("seeds = [-1]", r"seeds\[0\] is -1: it must be a whole number"),
         ("steps = 0", "steps is 0: it must be"),
+        ("learners = {}", "unknown 'learners': settings of an algorithm are in algorithms.NAME"),
         (f"steps = {10**23}", "steps"),
         ("steps = '80'", "steps is '80': it must be a whole number"),
         (
             "evaluation_episodes = 5\nfinal_episodes = 2",
             "final_episodes is 2: it must be as many as evaluation_episodes, 5, or more",
         ),
+        ('domain = {delay = "2..0"}', r"delay is 2\.\.0: swap them"),
         ("episode_steps = 1.5", "episode_steps is 1.5: it must be a whole"),
         ("environment = 7", "environment is 7: it must be a table"),
         ("environment = {g = 1979-05-27}", "environment has a date, or a num"),
@@ -206,6 +208,9 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
         "Encoders that ship with jbrep: pca-8. Your own are tables with a file: {name = ..., "
         "file = ...}.",
     ]
+    few = TINY.replace(algorithms=("sac-wide",), seeds=(0,)).notices
+    assert few[0] == "This study compares nothing: it has one seed."
+    assert few[1].startswith("sac-wide learns from step 25,600 on: ")
     assert TINY.replace(data=Data(steps=1000)).notices == TINY.notices[:1]
     path = written(tmp_path, f"representations = {json.dumps(representations)}")
     monkeypatch.setattr("jbrep.study.packing.estimate", lambda run: 60)

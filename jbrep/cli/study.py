@@ -126,6 +126,7 @@ def _announce(
 )
 @click.option("--out", type=PATH, help="A folder for it.  [default: the study's own]")
 @click.option("--all", "everything", is_flag=True, help="Print every table; the page has them.")
+@import_option
 @as_json
 def report(
     folder: Path,

@@ -39,7 +39,7 @@ class Report(NamedTuple):
     Attributes:
         folder: that has the page, the tables and the figures.
         tables: what these say.
-        notes: what the diagnostics that were given are missing.
+        notes: what the diagnostics that were given are missing, and what couldn't be played.
         paths: of the page, the summaries and the folder of the figures.
     """
 
@@ -102,7 +102,18 @@ def make_report(
             write_tables(folder)
         notes = add_diagnostics(folder, evaluations)
         tables = read_tables(folder, across_trainers)
+        notes += _without_references(tables)
         return Report(out, tables, notes, write_report(tables, out))
+
+
+def _without_references(tables: Tables) -> list[str]:
+    """A line where nothing is known of policies that don't look, so that little can be said."""
+    if unknown := sorted({*tables.record.tasks} - {*tables.references}):
+        return [
+            f"no policy could be played on {', '.join(unknown)}, to compare agents with: if a "
+            "module of yours makes it, add --import MODULE"
+        ]
+    return []
 
 
 def write_report(tables: Tables, out: Path) -> list[Path]:

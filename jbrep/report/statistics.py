@@ -15,6 +15,7 @@ from jbrep.report.shares import share_of, shares_of_runs
 from jbrep.report.tables import Tables
 from jbrep.report.words import (
     EFFECTS,
+    caveats,
     notes,
     over,
     probability,
@@ -335,7 +336,7 @@ def forecast_text(forecast: Forecast, planned: Planned, width: int | None = None
     parts.append(wrapped(summary, width))
     if forecast.prospects:
         parts.append(prospects_table(forecast.prospects).text(width))
-        parts += [wrapped(each, width) for each in (*notes(planned), EFFECTS)]
+        parts += [wrapped(each, width) for each in (*notes(planned), *caveats(planned), EFFECTS)]
     return "\n\n".join(parts)
 
 

@@ -126,6 +126,18 @@ def notes(planned: Planned) -> list[str]:
     ]
 
 
+def caveats(planned: Planned) -> list[str]:
+    """Where verdicts are wrong more often than planned, in sentences."""
+    margin, failing = planned.rules.margin, planned.rules.failing
+    if failing <= margin:
+        return []
+    return [
+        f"Where between {100 * margin:.3g} and {100 * failing:.3g} % of runs fail, "
+        f"{NOT_WORSE.name!r} is wrongly supported more often than that (docs/verdicts.md): a "
+        f"verdicts.failing of {margin:g} keeps to it, and takes more runs."
+    ]
+
+
 def _counts(verdicts: Sequence[Verdict]) -> Counter[str]:
     return Counter(verdict.verdict for verdict in verdicts)
 

@@ -224,3 +224,8 @@ def argument(algorithm: str, chosen: Hyperparameters, name: str) -> Any:
     """What an algorithm's class gets by that name, if only by default; None if it takes none."""
     usual, _ = parameters_of(algorithm)
     return chosen.algorithm_kwargs.get(name, usual[name].default) if name in usual else None
+
+
+def learns_from(algorithm: str, chosen: Hyperparameters) -> int:
+    """The control step from which an agent learns; until then it acts at random."""
+    return (argument(algorithm, chosen, "learning_starts") or 0) * chosen.action_repeat

@@ -9,7 +9,7 @@ from msgspec import UNSET, Meta, UnsetType
 from jbrep.envs.task import Id, Task, changed_parts
 from jbrep.errors import InputError, differences
 from jbrep.records.record import to_plain
-from jbrep.rl.presets import LINEAR, Hyperparameters, argument
+from jbrep.rl.presets import LINEAR, Hyperparameters, learns_from
 from jbrep.rl.settings import (
     CLASSES,
     Episodes,
@@ -108,8 +108,7 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
     @property
     def learns_from(self) -> int:
         """The step from which its agent learns; until then it acts at random."""
-        starts = argument(self.algorithm, self.hyperparameters, "learning_starts")
-        return self.control_steps(starts or 0)
+        return learns_from(self.algorithm, self.hyperparameters)
 
     def control_steps(self, agent_steps: int) -> int:
         """An agent's steps as runs count them: each for all control steps that hold its action."""

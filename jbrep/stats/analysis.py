@@ -146,7 +146,7 @@ def _analyse_group(
         policy: mean_within(np.array(returns[:starts]), first.bounds, LEVEL)
         for policy, returns in references.items()
     }
-    means = {policy: float(each.value) for policy, each in played.items()}
+    means = {policy: float(np.mean(returns)) for policy, returns in references.items()}
     scale = scale_of(known, first, played)
     baseline, *others = (
         describe(runs, known.curves[name], known.finals[name], scale, seed)

@@ -104,9 +104,16 @@ def final_return(curves: Array, grid: Array) -> Array:
 
 
 def end_on_all_starts(group: Mapping[str, Sequence[RunCurve]], grid: Array) -> bool:
-    """Whether all runs that didn't fail end with an evaluation of more episodes there."""
-    whole = [run for runs in group.values() for run in runs if run.failed_at is None]
-    return bool(whole) and all(r.final is not None and r.steps[-1] <= grid[-1] for r in whole)
+    """Whether final returns can be those of an evaluation of more episodes.
+
+    All runs that didn't fail end with one on the grid, and the return that gains are counted over
+    doesn't have to be read off the curves, which are of fewer episodes.
+    """
+    every = [run for runs in group.values() for run in runs]
+    whole = [run for run in every if run.failed_at is None]
+    is_known = all(r.reference is not None or r.return_floor is not None for r in every)
+    ends = all(r.final is not None and r.steps[-1] <= grid[-1] for r in whole)
+    return bool(whole) and is_known and ends
 
 
 def final_returns(

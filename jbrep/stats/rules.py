@@ -387,7 +387,7 @@ def levels(shares: Sequence[float], level: float) -> tuple[float, ...]:
         told = ", ".join(f"{share:g}" for share in shares)
         raise InputError(
             f"no levels can be computed for looks at {told} of the runs and an error of {level:g}: "
-            "plan fewer looks, further apart"
+            "plan fewer looks, further apart, or an error near 0.05"
         ) from None
     return tuple(2 * norm.sf(constant / np.sqrt(shares)).astype(float))
 

@@ -42,9 +42,9 @@ def best_blind(returns: Mapping[str, float]) -> str | None:
 def reference_of(run: RunCurve, curves: Array) -> float:
     """The return that gains are counted over, on all starts of the last evaluation.
 
-    That is the run's own reference where it is known, else the least possible return of the task,
-    else the mean return at the first step of the baseline's curves on the grid, (runs, g), that is,
-    of its untrained policies.
+    That is the run's own reference where it is known, else the least possible return of the task.
+    Where neither is known, it is that of untrained policies on the starts of the curves: the mean
+    at the first step of the baseline's on the grid, (runs, g).
     """
     known = (each for each in (run.reference, run.return_floor) if each is not None)
     return float(next(known, curves[:, 0].mean()))

@@ -11,7 +11,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from jbrep.dataset.settings import MAX_ROOT_SEED
 from jbrep.encoders.shipped import UNLEARNED
-from jbrep.envs.domain import read_ranges
+from jbrep.envs.domain import Domain, read_ranges
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES
 from jbrep.errors import InputError
@@ -20,6 +20,7 @@ from jbrep.records.record import Record, from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.records.toml import read_toml, toml_text
 from jbrep.rl.learner import Learner
+from jbrep.rl.presets import learns_from
 from jbrep.rl.run import trainer_of
 from jbrep.rl.settings import MAX_STEPS, Seed, TrainingSettings
 from jbrep.stats.arms import FEWEST_UNITS
@@ -158,7 +159,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if len(set(values)) < len(values):
                 raise InputError(f"{name} is {values}: it must have each once")
         self._check_tasks()
-        read_ranges(self.domain or {})
+        Domain(**read_ranges(self.domain or {}))
         for algorithm in self.algorithms:
             for each in self.learner(algorithm).variants:
                 trainer_of(each, self)
@@ -229,12 +230,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 f"verdicts.baseline is {baseline!r}: it must be one of the representations, "
                 f"{', '.join(names)}"
             )
-        counts = self.planned.counts
-        if len(set(counts)) < len(counts):
-            raise InputError(
-                f"verdicts.looks are {list(self.verdicts.looks)}: of {len(self.seeds)} seeds, they "
-                f"come after {' and '.join(map(str, counts))}"
-            )
+        self._check_looks()
         for cell in self.verdicts.primary:
             if cell not in cells or not self.comparisons:
                 raise InputError(
@@ -254,6 +250,19 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                     f"{each.name} has {each.encoders} encoders for {runs} seeds: each must have "
                     f"one run, or each at least two, so give at most {runs // 2}, or {runs}"
                 )
+
+    def _check_looks(self) -> None:
+        counts, looks = self.planned.counts, f"verdicts.looks are {list(self.verdicts.looks)}"
+        if len(set(counts)) < len(counts):
+            raise InputError(
+                f"{looks}: of {len(self.seeds)} seeds, they come after "
+                f"{' and '.join(map(str, counts))}"
+            )
+        if self.verdicts.primary and FEWEST_UNITS > counts[0] < counts[-1]:
+            raise InputError(
+                f"{looks}: the first comes after {counts[0]} seeds, and verdicts take "
+                f"{FEWEST_UNITS}"
+            )
 
     @property
     def baseline(self) -> str:
@@ -313,11 +322,21 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         ]
         if not self.comparisons:
             lines.append("This study compares nothing: it has one representation.")
+        elif len(self.seeds) == 1:
+            lines.append("This study compares nothing: it has one seed.")
         elif not self.verdicts.primary:
             lines.append(
                 "This study is exploratory: its report will give no verdicts, as its file names no "
                 "cell in verdicts.primary."
             )
+        for name in self.algorithms:
+            learner = self.learner(name)
+            first = learns_from(learner.algorithm, learner.hyperparameters)
+            if self.steps <= first:
+                lines.append(
+                    f"{name} learns from step {first:,} on: {self.steps:,} steps leave its "
+                    "policies as they were drawn."
+                )
         shipped = [
             each.name
             for each in self.observed
@@ -342,6 +361,8 @@ def read_study(path: Path) -> Study:
         raise InputError(f"no study at {path}: it must be a TOML file")
     given = read_toml(path)
     try:
+        if "learners" in given:  # which files of jbrep have beside names
+            raise InputError("unknown 'learners': settings of an algorithm are in algorithms.NAME")
         study = as_study(given)
         for task in study.tasks:
             find_spec(task)
