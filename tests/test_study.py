@@ -477,12 +477,28 @@ def test_a_stopped_study_leaves_checkpoints_and_no_workers(tmp_path):
     told = process.communicate(timeout=120)[1]
     assert (process.returncode, "Traceback" in told) == (128 + signal.SIGINT, False), told
     assert workers
-    wait_for_the_end_of(workers, seconds=1)
+    wait_for_the_end_of(workers, seconds=60)
     assert "stopping: the runs under way write their checkpoints" in told
     assert len(list(out.rglob(CHECKPOINT))) == 1
     told = jbrep("report", out)
     assert told.exit_code == 2
     assert told.stderr == f"Error: no finished run below {out}: jbrep study resumes it\n"
+
+
+def test_a_terminal_shows_the_runs_under_way_and_the_time_left(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    plan = Plan(TINY, tmp_path)
+    progress = Progress(plan, plan.cells)
+    assert progress._summary().endswith("4 to go, - left")
+    folder = plan.folder_of(plan.cells[0])
+    folder.mkdir(parents=True)
+    (folder / PROGRESS).write_text("40 12")
+    clock[0] = 20.0
+    shown = progress._table()
+    assert shown.row_count == 1
+    assert [*shown.columns[1].cells, *shown.columns[2].cells] == ["40 of 80", "12"]
+    assert shown.caption == "0 finished, 0 failed, 0 crashed, 4 to go, 2.3 min left"  # 280 of 40
 
 
 def test_progress_is_a_line_for_each_run_where_there_is_no_terminal(done, capsys, monkeypatch):

@@ -195,7 +195,7 @@ def test_a_dry_run_tells_what_could_be_found(tmp_path, monkeypatch):
     assert "face_direction/sac/dae-8: less variance" in words
     assert "Verdicts may come after 8 and 16 runs of each arm" in words
     assert "exploratory: its report" not in words
-    assert "Where between 10 and  % of runs fail, 'not worse' is wrongly supported" in words
+    assert "Where between 10 and 25 % of runs fail, 'not worse' is wrongly supported" in words
 
 
 def test_power_is_that_of_the_t_test():
