@@ -3,7 +3,6 @@
 import os
 import signal
 import sys
-import time
 
 import gymnasium
 import numpy as np
