@@ -22,6 +22,7 @@ from foreign import GYRO, PITCH, RATE, TIMES, VOLTS, csv_rows, lerobot_folder, w
 from small import flip_bit
 
 from jbrep.collect import collect
+from jbrep.collect.derive import derive_view
 from jbrep.dataset import Dataset, DataSettings, Layout, ScaledDataset
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
@@ -233,6 +234,27 @@ def test_rewards_for_data_that_exist_already(tmp_path, rewards):
         assert not list(tmp_path.glob(f"{name}/*.h5"))
     Path("my_rewards.py").write_text(f"{REWARD}# mended\n")
     assert "reward my_rewards:upright" in mistake(*derive, data.folder, *code)
+
+
+def test_a_folder_holds_what_was_derived_from_one_import(tmp_path):
+    """Of a log that was corrected and imported once more: with the same settings, or more rows."""
+    derived = tmp_path / "derived"
+    source = {}
+    for name, sign, trials in (("a", 1, 5), ("b", -1, 5), ("c", -1, 9), ("d", 1, 9)):
+        rows = np.arange(20 * trials)
+        table = {"x": sign * np.sin(rows), "y": rows, "u": np.cos(rows), "trial": rows // 20}
+        path = write_csv(tmp_path / "log.csv", table)
+        source[name] = imported(path, "--actions", "u", "--episode", "trial", out=name)[1].folder
+    derive_view(source["a"], derived, ["y"])
+    for other in "bc":
+        told = mistake("data", "derive", source[other], "--hide", "y", "--out", derived)
+        assert f"derived was derived from other data than {source[other]}" in told
+    assert (
+        "nothing was done"
+        in jbrep(*("data", "derive", source["a"], "--hide", "y", "--out", derived)).output
+    )
+    derive_view(source["d"], derived, ["y"])
+    np.testing.assert_array_equal(Dataset(derived)["x"], Dataset(source["d"])["x"])
 
 
 def test_data_without_rewards_go_through_what_needs_none(tmp_path):

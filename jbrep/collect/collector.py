@@ -84,8 +84,9 @@ def collect(
     simulator = Simulator(settings, policy, lanes, num_threads, retries)
     produce = choose(backend, BACKENDS, "backend")(simulator)
 
-    def check() -> None:
-        _check_environment(folder, num_threads)
+    def check(wanted: Manifest) -> None:
+        if not wanted.complete:
+            _check_environment(folder, num_threads)
 
     return write_shards(settings, folder, produce, policy.files(), check)
 
@@ -110,7 +111,8 @@ def write_shards(
     folder: Path,
     produce: Produce,
     files: Mapping[str, bytes] = MappingProxyType({}),
-    check: Callable[[], None] = lambda: None,
+    check: Callable[[Manifest], None] = lambda wanted: None,
+    source: Manifest | None = None,
 ) -> Manifest:
     """Commit the missing shards, until there are as many rows as the settings ask for.
 
@@ -120,18 +122,20 @@ def write_shards(
         produce: makes shards, one after the other; of the last, only the episodes that are needed
             are kept.
         files: that the data set needs besides, by name.
-        check: called before episodes are added to those that are there.
+        check: called with the manifest of what is wanted, where episodes are there already: whether
+            they may stay, and others be added to them.
+        source: of the data that these are derived from, see `new_manifest`.
 
     Raises:
         InputError: as `collect` does.
     """
     make_folder(folder, ("manifest*", "shard-*", "policy-*"))
     with exclusive(folder):
-        there = _begin(settings, folder, files)
+        there = _begin(new_manifest(settings, source), folder, files)
         manifest = there.extended(settings.steps)
+        if there.shards:
+            check(manifest)
         if not manifest.complete:
-            if there.shards:
-                check()
             with Progress(
                 total=settings.steps,
                 initial=manifest.rows,
@@ -246,23 +250,22 @@ class _Writing:
         return f"{counted(manifest.episodes, 'episode')} of {manifest.rows:,} rows are kept"
 
 
-def _begin(settings: DataSettings, folder: Path, files: Mapping[str, bytes]) -> Manifest:
-    """The manifest to go on from, new if there is none."""
-    shards = hdf5_files(folder)
+def _begin(wanted: Manifest, folder: Path, files: Mapping[str, bytes]) -> Manifest:
+    """The manifest to go on from: what is there, or what is wanted, without shards."""
+    settings, shards = wanted.settings, hdf5_files(folder)
     if (folder / MANIFEST).exists() or shards:
         manifest = current_manifest(folder)
-        _check_same(manifest, new_manifest(settings), folder)
+        _check_same(manifest, wanted, folder)
         check_files(folder, manifest, shards)
         if manifest != read_manifest(folder):
             write_manifest(folder, manifest)
         _keep(files, folder)
         check_space(folder, (settings.steps - manifest.rows) * settings.row_bytes())
-    else:
-        manifest = new_manifest(settings)
-        check_space(folder, settings.steps * settings.row_bytes())
-        _keep(files, folder)
-        write_manifest(folder, manifest)
-    return manifest
+        return manifest
+    check_space(folder, settings.steps * settings.row_bytes())
+    _keep(files, folder)
+    write_manifest(folder, wanted)
+    return wanted
 
 
 def _keep(files: Mapping[str, bytes], folder: Path) -> None:

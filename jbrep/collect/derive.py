@@ -16,7 +16,8 @@ from jbrep.collect.shards import Produce, Remaining
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import Manifest, new_manifest, open_shard
 from jbrep.dataset.rewards import reward_function, with_hash, without_range
-from jbrep.dataset.schema import EPISODES, Columns, episode_columns
+from jbrep.dataset.schema import EPISODES, Columns, episode_columns, some_episodes
+from jbrep.dataset.shard import column_hashes
 from jbrep.dataset.verify import policy_files
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.recording import Tick
@@ -81,7 +82,8 @@ def derive(
             f"--task {task_name} instead"
         )
     derived = _Deriver(task, settings, num_threads)
-    return write_shards(settings, folder, _each_shard(dataset, derived))
+    produce = _each_shard(dataset, derived)
+    return write_shards(settings, folder, produce, source=dataset.manifest)
 
 
 def derive_view(
@@ -102,8 +104,8 @@ def derive_view(
             empty.
 
     Raises:
-        InputError: the source is unfinished or was made with other versions; or as `with_view`,
-            `reward_function` or `collect`.
+        InputError: the source is unfinished or was made with other versions, the folder holds what
+            was derived from other data; or as `with_view`, `reward_function` or `collect`.
         DamageError: the file of a policy that acted in it is damaged or missing.
     """
     dataset = Dataset(source)
@@ -124,8 +126,34 @@ def derive_view(
             columns = change(columns)
         return settings.columns(columns)
 
-    files = policy_files(source, dataset.manifest)
-    return write_shards(settings, folder, _each_shard(dataset, changed), files)
+    def check(wanted: Manifest) -> None:
+        _check_derived(folder, wanted, dataset, changed)
+
+    files, produce = policy_files(source, dataset.manifest), _each_shard(dataset, changed)
+    return write_shards(settings, folder, produce, files, check, dataset.manifest)
+
+
+def _check_derived(
+    folder: Path, wanted: Manifest, dataset: Dataset, change: Callable[[Columns], Columns]
+) -> None:
+    """Check that what a folder holds was derived from these data, by the hashes of its columns.
+
+    Settings alone don't say so: they are the same of a log that was imported once more.
+    """
+    source, known = dataset.folder, dataset.manifest
+
+    def hashes(shard: int, episodes: int) -> dict[str, str]:
+        columns = change(open_shard(source, known, shard))
+        return column_hashes(some_episodes(columns, 0, episodes))
+
+    entries = enumerate(wanted.shards)
+    is_same = len(wanted.shards) <= len(known.shards) and all(
+        hashes(shard, entry.episodes) == entry.sha256 for shard, entry in entries
+    )
+    if not is_same:
+        raise InputError(
+            f"{folder} was derived from other data than {source}: choose another folder"
+        )
 
 
 def _rewarded(code: str) -> Callable[[Columns], Columns]:
@@ -160,7 +188,8 @@ def _check_finished(dataset: Dataset) -> None:
 
 def _check_versions(dataset: Dataset, settings: DataSettings) -> None:
     """Check that MuJoCo, NumPy and h5py are those of a data set; jbrep may be later."""
-    earlier, versions = dataset.manifest.versions, new_manifest(settings).versions
+    earlier = dataset.manifest.versions
+    versions = new_manifest(settings, dataset.manifest).versions
     if differing := differences({**earlier, "jbrep": versions["jbrep"]}, versions):
         raise InputError(
             f"{dataset.folder} was collected with other versions: {differing}; a derived data set "
@@ -170,7 +199,7 @@ def _check_versions(dataset: Dataset, settings: DataSettings) -> None:
 
 def _check_replay(dataset: Dataset, settings: DataSettings, num_threads: int | None) -> None:
     """Check that this jbrep gives the states of a data set, if another has made it."""
-    now = new_manifest(settings).versions["jbrep"]
+    now = new_manifest(settings, dataset.manifest).versions["jbrep"]
     if dataset.manifest.versions["jbrep"] != now and (
         problem := next(replay_problems(dataset, 1, num_threads), None)
     ):

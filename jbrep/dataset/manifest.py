@@ -159,14 +159,25 @@ def shard_name(shard: int) -> str:
     return f"shard-{shard:05d}.h5"
 
 
-def new_manifest(settings: DataSettings) -> Manifest:
-    """A manifest without shards, of the installed versions of jbrep's and the environment's."""
+def new_manifest(settings: DataSettings, source: Manifest | None = None) -> Manifest:
+    """A manifest without shards, of the installed versions of jbrep's and the environment's.
+
+    Args:
+        settings: of the data set.
+        source: of the data that it is derived from, which know the versions of the environment:
+            that need not be here then.
+
+    Raises:
+        InputError: the environment isn't here.
+    """
     from importlib.metadata import version  # slow to import, and readers don't need it
 
     from jbrep.envs.names import environment_versions
 
     versions = {name: version(name) for name in _PACKAGES}
-    if not settings.is_imported:  # or else they come from an environment that may not be here
+    if source:
+        versions = {**source.versions, **versions}
+    elif not settings.is_imported:  # or else they come from an environment that may not be here
         versions |= environment_versions(settings.task)
     return Manifest(settings=settings, versions=versions, commits=dict(commits()))
 
