@@ -603,6 +603,22 @@ def test_units_are_of_columns_or_their_numbers_and_of_no_others(tmp_path):
         Dataset.from_table(tmp_path / "b", table, layout.replace(units={"S": "deg"}))
 
 
+def test_angles_of_what_jbrep_exported_are_turned_to_the_end(tmp_path):
+    pitch = 100.0 * np.arange(9) - 170
+    rows = {"pitch": pitch, "u": pitch / 900, "trial": np.arange(9) // 3}
+    layout = Layout(observations=("pitch",), actions=("u",), episode="trial")
+    layout = layout.replace(units={"pitch": "deg"})
+    Dataset.from_table(tmp_path / "deg", rows, layout)
+    out = tmp_path / "deg.parquet"
+    assert jbrep("data", "export", tmp_path / "deg", "--to", "parquet", "--out", out).exit_code == 0
+    _, data = imported(out, "--angles", "pitch")
+    (feature,) = data.task.features
+    assert (feature.kind, feature.unit, data.task.id) == ("angle", "rad", "deg")
+    turned = np.angle(np.exp(1j * np.radians(pitch))).reshape(3, 3)
+    np.testing.assert_allclose(np.reshape(data["pitch"], (3, 2)), turned[:, :2], rtol=1e-5)
+    np.testing.assert_allclose(data.episodes["final_observation"], turned[:, 2:], rtol=1e-5)
+
+
 def test_an_option_comes_before_the_file_even_where_it_is_the_default(tmp_path):
     rows = {"t": [i / 5 for i in range(6)], "x": range(6), "u": [0.5] * 6}
     path, file = write_csv(tmp_path / "a.csv", rows), tmp_path / "layout.toml"

@@ -3,7 +3,6 @@
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -67,7 +66,6 @@ def source_of_table(table: Table, given: Layout | None = None, missing: str = ""
     layout = _both(table, given or Layout())
     roles = roles_of(table, layout)
     seen, is_own = roles["observation"], is_of_task(table, roles)
-    table = replace(table, once=_once_of(table, seen))
     reader = _Reader(table, layout, roles, missing)
     return Source(
         table.name,
@@ -78,23 +76,11 @@ def source_of_table(table: Table, given: Layout | None = None, missing: str = ""
         why_no_task="its columns aren't those of its task" if table.task else Source.why_no_task,
         rows=None if layout.rate else table.rows,
         has_rewards="reward" in roles,
-        subtracted=np.array([each.subtracted for each in seen]),
+        subtracted=reader.factors * [each.subtracted for each in seen],
         timestep=1 / layout.rate if layout.rate else table.timestep or reader.timestep,
         notes=reader.notes(),
         changes=reader.changes,
     )
-
-
-def _once_of(table: Table, seen: list[Leaf]) -> dict[str, Array]:
-    """What is known once for each episode, of the columns that are observed."""
-    names = table.task.feature_names if table.task else ()
-    once = {**table.once}
-    if not {each.name for each in seen} <= {*names}:
-        once.pop("final_observation", None)
-    elif "final_observation" in once:
-        chosen = [names.index(each.name) for each in seen]
-        once["final_observation"] = once["final_observation"][:, chosen]
-    return once
 
 
 def _both(table: Table, given: Layout) -> Layout:
@@ -124,7 +110,7 @@ class _Reader:
         seen = roles["observation"]
         self._angles = np.array([each.is_angle for each in seen])
         turned = self._angles & np.array([each.unit in DEGREES for each in seen])
-        self._factors = np.where(turned, math.pi / 180, 1)
+        self.factors = np.where(turned, math.pi / 180, 1)  # of what is observed, (d,)
         self._columns = list(dict.fromkeys(e.column for some in roles.values() for e in some))
         self.timestep = self._timestep() if "time" in roles else None
 
@@ -141,9 +127,26 @@ class _Reader:
         if layout.time:
             chunks = clock.cut(name, chunks)
         most = MOST_RAW if layout.rate or layout.length else MAX_EPISODE_STEPS
-        for episode in split(name, chunks, self._table.once, most, clock.parts):
+        for episode in split(name, chunks, self._once(), most, clock.parts):
             self._counts["last"] -= len(episode.action)
             yield episode
+
+    def _once(self) -> dict[str, Array]:
+        """What is known once for each episode, of the columns that are observed."""
+        once, task = {**self._table.once}, self._table.task
+        if (final := once.pop("final_observation", None)) is not None and task:
+            names, seen = task.feature_names, [each.name for each in self._roles["observation"]]
+            if {*seen} <= {*names}:
+                chosen = final[:, [names.index(name) for name in seen]]
+                once["final_observation"] = self._turned(chosen)
+        return once
+
+    def _turned(self, seen: Array) -> Array:
+        """Observations (n, d) with their angles in [-pi, pi) rad."""
+        if not self._angles.any():
+            return seen
+        turned = seen * self.factors
+        return np.where(self._angles, wrapped(turned), turned)
 
     def _rows(self) -> Iterator[Rows]:
         """The rows by role, some at a time."""
@@ -171,10 +174,8 @@ class _Reader:
             if "episode" in rows and rows["episode"].dtype.kind not in "iu":
                 numbers = [labels.setdefault(e, len(labels)) for e in rows["episode"].tolist()]
                 rows["episode"] = np.array(numbers, int)
-            for role in ("observation", "next_observation") if self._angles.any() else ():
-                if role in rows:
-                    turned = rows[role] * self._factors
-                    rows[role] = np.where(self._angles, wrapped(turned), turned)
+            for role in {"observation", "next_observation"} & rows.keys():
+                rows[role] = self._turned(rows[role])
             first += batch.num_rows
             self._counts["rows"] += batch.num_rows
             yield rows
@@ -269,7 +270,7 @@ class _Reader:
         if self._layout.time and not self._layout.rate and self.timestep is None:
             notes.append("the clock is uneven: --rate brings the rows to an even one")
         if self._angles.any():
-            degrees = int((self._factors != 1).sum())
+            degrees = int((self.factors != 1).sum())
             angles = counted(int(self._angles.sum()), "angle")
             notes.append(f"{angles} brought to [-pi, pi) rad, {degrees} of them from degrees")
         return tuple(notes)

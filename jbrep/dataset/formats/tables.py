@@ -206,11 +206,16 @@ def _others(table: Table, leaves: list[Leaf], roles: Roles) -> Iterator[Leaf]:
 
 
 def is_of_task(table: Table, roles: Roles) -> bool:
-    """Whether observations and actions are those of the table's task, in its order."""
-    names = tuple(each.name for each in roles["observation"])
+    """Whether observations and actions are those of the table's task, in its order.
+
+    Those that are said to be angles, or in other units, are others.
+    """
+    if not table.task or any(each.is_angle for each in roles["observation"]):
+        return False
+    seen = [(each.name, each.unit) for each in roles["observation"]]
     actions = [table.schema.get_field_index(each.column) for each in roles["action"]]
-    known = table.task.feature_names if table.task else ()
-    return names == known and actions == sorted(actions)
+    known = [(each.name, each.unit) for each in table.task.features]
+    return seen == known and actions == sorted(actions)
 
 
 def _matching(
