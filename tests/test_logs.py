@@ -548,6 +548,15 @@ def test_a_bag_of_ros(kind, tmp_path):
         np.testing.assert_array_equal(same["observation"], data["observation"])
 
 
+@pytest.mark.parametrize("joints", [("a", "a"), ("", ""), ("a", "")])
+def test_names_that_tell_no_joints_apart_are_numbers(joints, tmp_path):
+    path = write_bag(tmp_path / "walk", "mcap", joints=joints)
+    names = ("--observations", "/joint_states.position.*", "--actions", "/arm/command.data")
+    _, data = imported(path, *names, "--rate", "100", "--gap", "0.15")
+    assert data.task.feature_names == ("joint_states.position.0", "joint_states.position.1")
+    assert data["observation"][5].tolist() != [0, 0]
+
+
 def test_messages_without_numbers_end_no_bag(tmp_path):
     path = write_bag(tmp_path / "walk", "mcap", silent=(0, 50))
     names = ("--observations", "/joint_states.position.*", "--actions", "/arm/command.data")
@@ -677,6 +686,28 @@ def test_whole_numbers_that_floats_do_not_hold_are_refused(tmp_path):
     table["x"] -= 1
     with pytest.raises(InputError, match="row 2"):
         Dataset.from_table(tmp_path / "b", table, layout)
+    path = write_csv(tmp_path / "a.csv", {name: each.tolist() for name, each in table.items()})
+    with pytest.raises(InputError, match=r"a\.csv, line 4: 'x' is 9007199254740993: whole numbers"):
+        Dataset.from_file(tmp_path / "c", path, layout=layout)
+    table["x"] = pandas.array([5, None, *table["x"][2:]], dtype="Int64")
+    with pytest.raises(InputError, match=r"row 2: 'x' is 9007199254740993"):
+        Dataset.from_table(tmp_path / "d", table, layout, missing="hold:1")
+    rows = {"observations": (1 << 53) + np.arange(8)[:, None], "actions": np.zeros((8, 1))}
+    np.savez(tmp_path / "a.npz", **rows, timeouts=np.arange(8) == 7)
+    told = r"a\.npz: episode 0, step 1: the observation is 9007199254740993: whole numbers"
+    with pytest.raises(InputError, match=told):
+        Dataset.from_file(tmp_path / "e", tmp_path / "a.npz")
+    bag = write_bag(tmp_path / "walk", "mcap", count=(1 << 53) - 9)
+    names = Layout(observations=("/count.data",), actions=("/arm/command.data",), rate=100)
+    with pytest.raises(InputError, match=r"/count at 1700000000\.100 s: /count\.data is 90071"):
+        Dataset.from_file(tmp_path / "f", bag, layout=names)
+
+
+def test_times_in_nanoseconds_keep_their_digits(tmp_path):
+    rows = {"t": 1_700_000_000_000_000_001 + 100 * np.arange(50), "x": np.arange(50)}
+    path = write_csv(tmp_path / "a.csv", rows | {"u": np.zeros(50)})
+    names = ("--observations", "x", "--actions", "u", "--time", "t", "--units", "t=ns")
+    assert imported(path, *names)[1].task.timestep == 1e-7
 
 
 def test_missing_readings_count_where_an_episode_has_no_whole_step(tmp_path):

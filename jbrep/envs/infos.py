@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from jbrep.records.record import MOST_WHOLE
 from jbrep.text import counted
 
 SUCCESS = "is_success"  # what robots of Gymnasium and stable-baselines3 call it
 Numbers = dict[str, float]  # by name; of a truth, 1 or 0
-_MOST = 1 << 53  # a float holds whole ones exactly
 _MAX_NAME = 64
 _OF_STEPS = "timestep."  # begins what Shimmy tells of dm_control's steps: whether they are the last
 
@@ -21,7 +21,7 @@ def number_of(value: Any) -> float | None:
     """
     if isinstance(value, np.generic):
         value = value.item()
-    is_number = isinstance(value, bool | int | float) and abs(value) <= _MOST
+    is_number = isinstance(value, bool | int | float) and abs(value) <= MOST_WHOLE
     return float(value) if is_number else None
 
 

@@ -23,6 +23,7 @@ from jbrep.text import printable
 
 _Kind = TypeVar("_Kind")
 
+MOST_WHOLE = 1 << 53  # that floats hold, as they do all whole numbers below
 _LARGEST = sys.float_info.max
 Finite = Annotated[float, Meta(ge=-_LARGEST, le=_LARGEST, title="a finite number")]
 

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from jbrep.errors import DamageError
+from jbrep.records.record import MOST_WHOLE
 from jbrep.records.storage import exists, read_regular, write_whole
 
 _Row = TypeVar("_Row", bound=NamedTuple)
 Columns = Mapping[str, Callable[[str], Any]]  # by their names: what their cells are
 
 _MAX_BYTES = 1 << 28
-_MOST = 1 << 53  # of a number: a float holds whole ones exactly
 _LARGEST = 1e100  # number whose square is one, too
 
 
@@ -123,7 +123,7 @@ def count(cell: str) -> int:
         ValueError: it is something else.
     """
     number = int(cell)
-    if not 0 <= number < _MOST:
+    if not 0 <= number < MOST_WHOLE:
         raise ValueError
     return number
 

@@ -15,7 +15,7 @@ from jbrep.encoders.base import OWN
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.document import Document
-from jbrep.records.record import Record, Version, from_plain, to_plain
+from jbrep.records.record import MOST_WHOLE, Record, Version, from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, RunRecord
 from jbrep.rl.run_settings import RunSettings, SharedSettings
@@ -30,9 +30,8 @@ RECORD = "runs.json"
 EACH_ITS_OWN = "runs have different encoders"
 _Value = TypeVar("_Value")
 
-_MOST = 1 << 53  # of a number: a float holds whole ones exactly
-Count = Annotated[int, Meta(ge=0, le=_MOST)]
-Size = Annotated[int, Meta(ge=1, le=_MOST)]
+Count = Annotated[int, Meta(ge=0, le=MOST_WHOLE)]
+Size = Annotated[int, Meta(ge=1, le=MOST_WHOLE)]
 Layer = tuple[Size, str]  # units and activation
 Layers = Annotated[tuple[Layer, ...], Meta(max_length=100)]
 

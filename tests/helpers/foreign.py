@@ -79,8 +79,8 @@ def lerobot_folder(folder, version="v3.0", **features):
     return folder
 
 
-def write_bag(path, kind, silent=()):
-    """Joints at 100 Hz in changing order, commands at 10 Hz that pause, and words.
+def write_bag(path, kind, silent=(), joints=("hip", "knee"), count=0):
+    """Joints at 100 Hz in changing order, commands at 10 Hz that pause, a count, and words.
 
     Messages of silent joints, by their numbers, have none.
     """
@@ -101,18 +101,21 @@ def write_bag(path, kind, silent=()):
             for topic, name in {
                 "/joint_states": "sensor_msgs/msg/JointState",
                 "/arm/command": "std_msgs/msg/Float64",
+                "/count": "std_msgs/msg/Int64",
                 "/rosout": "std_msgs/msg/String",
             }.items()
         }
         for i in range(300):
             time = 1_700_000_000_000_000_000 + i * 10_000_000
-            names, angles = ["hip", "knee"], np.array([i / 100, -i / 100])
+            names, angles = [*joints], np.array([i / 100, -i / 100])
             if i % 2:
                 names, angles = names[::-1], angles[::-1].copy()
             if i in silent:
                 names, angles = [], empty
-            joints = types["sensor_msgs/msg/JointState"](header, names, angles, empty, empty)
-            writer.write(made["/joint_states"], time, pack(joints, joints.__msgtype__))
+            state = types["sensor_msgs/msg/JointState"](header, names, angles, empty, empty)
+            writer.write(made["/joint_states"], time, pack(state, state.__msgtype__))
+            ticks = types["std_msgs/msg/Int64"](count + i)
+            writer.write(made["/count"], time, pack(ticks, ticks.__msgtype__))
             if i % 10 == 5 and not 100 < i < 200:
                 command = types["std_msgs/msg/Float64"](float(i))
                 writer.write(made["/arm/command"], time, pack(command, command.__msgtype__))

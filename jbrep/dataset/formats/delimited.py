@@ -14,6 +14,7 @@ import pyarrow.csv as pa_csv
 from jbrep.dataset.formats.episodes import label
 from jbrep.dataset.formats.tables import DEGREES, RADIANS, SECONDS, UNIT, Table
 from jbrep.errors import InputError, first_line
+from jbrep.records.record import MOST_WHOLE
 
 _SEPARATORS = ",;\t|"
 _COMMENTS = ("#", "%")
@@ -22,6 +23,7 @@ _EMPTY = [*_MISSING, "-", "--"]  # which stand for no unit, too
 _UNIT = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\])]*)[\])]")
 _TELLING = {*RADIANS, *DEGREES, *SECONDS}  # units that change what numbers mean
 _PLACE = re.compile(r"\w[\[(]\d+[\])]$")  # of q[0], which is no unit
+_WHOLE = re.compile(r"-?[0-9]{1,30}")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d\S*")
 _ZONE = re.compile(r"(Z|[+-]\d\d:?\d\d)$")
@@ -127,9 +129,15 @@ def _type(cells: list[str], decimal: str) -> pa.DataType:
         return pa.bool_()
     if all(_DATE.fullmatch(cell) for cell in some) and some:
         return pa.timestamp("ns", tz="UTC" if _ZONE.search(some[0]) else None)
+    if any(map(_loses_digits, some)) and all(map(_WHOLE.fullmatch, some)):
+        return pa.int64()  # exact, as of times in ns
     if not some or _is_number(some[0].replace(decimal, ".")):
         return pa.float64()
     return pa.string()
+
+
+def _loses_digits(cell: str) -> bool:
+    return bool(_WHOLE.fullmatch(cell)) and abs(int(cell)) > MOST_WHOLE
 
 
 def _is_number(cell: str) -> bool:

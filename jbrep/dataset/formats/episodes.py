@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from jbrep.dataset.schema import UNKNOWN_SEED
 from jbrep.envs.task import MAX_FEATURES, Feature, Task
 from jbrep.errors import InputError, listed
+from jbrep.records.record import MOST_WHOLE
 from jbrep.text import slug
 
 Array = NDArray[Any]
@@ -135,6 +136,8 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
     if not len(rows["action"]):
         return
     _check_steps(where, rows)
+    for name in {*WIDE} & rows.keys():
+        check_whole(rows[name], f"{where}, step {{}}: the {name.replace('_', ' ')}".format)
     following = _following(where, rows)
     final = once.get("final_observation", following)
     observation = _flat(rows["observation"])
@@ -197,6 +200,32 @@ def _following(where: str, rows: Rows) -> Array | None:
         )
     last: Array = rows["next_observation"][-1]
     return last
+
+
+def check_whole(values: Array, told: Callable[[int], str]) -> None:
+    """Refuse whole numbers that floats of 64 bits don't hold.
+
+    Args:
+        values: with rows.
+        told: where they stand and what they are called, by the number of a row.
+
+    Raises:
+        InputError: there is one.
+    """
+    if values.dtype.kind not in "iu":
+        return
+    beyond = (values > MOST_WHOLE) | (values < -MOST_WHOLE)
+    if beyond.any():
+        first = np.argwhere(beyond)[0]
+        raise digits_lost(told(int(first[0])), int(values[tuple(first)]))
+
+
+def digits_lost(told: str, number: int) -> InputError:
+    """That a whole number is beyond `MOST_WHOLE`; told is where it stands and what it is called."""
+    return InputError(
+        f"{told} is {number}: whole numbers beyond 2**53 lose digits; subtract something from the "
+        "column first, or leave it out"
+    )
 
 
 def _flat(values: Array) -> NDArray[np.float64]:

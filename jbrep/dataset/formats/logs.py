@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from jbrep.coordinates import wrapped
 from jbrep.dataset.formats.clock import MOST_RAW, Clock, timestep_of
-from jbrep.dataset.formats.episodes import WIDE, Incoming, Rows, Source
+from jbrep.dataset.formats.episodes import WIDE, Incoming, Rows, Source, check_whole
 from jbrep.dataset.formats.flat import split
 from jbrep.dataset.formats.tables import (
     DEGREES,
@@ -31,8 +32,6 @@ from jbrep.errors import InputError, listed
 from jbrep.text import counted
 
 Array = NDArray[Any]
-
-_LARGEST = 1 << 53  # whole number that floats hold, and all below
 
 _SAID = {  # of what is counted: what it is, and what became of it
     "rows": ("row", "read"),
@@ -163,7 +162,7 @@ class _Reader:
                 for leaf, values in zip(leaves, each, strict=True):
                     self._check(leaf, role, values, first)
                     if role in WIDE:
-                        self._check_whole(leaf, values, first)
+                        self._check_whole(leaf, batch.column(leaf.column), first)
                 rows[role] = np.stack(each, axis=1) if role in WIDE else each[0]
             if "time" in rows:
                 time = rows["time"]
@@ -190,17 +189,12 @@ class _Reader:
                 "correct it, leave the row out, or give --missing"
             )
 
-    def _check_whole(self, leaf: Leaf, values: Array, first: int) -> None:
-        """Refuse whole numbers that floats of 64 bits don't hold."""
-        if values.dtype.kind not in "iu" or not len(values):
-            return
-        beyond = (values > _LARGEST) | (values < -_LARGEST if values.dtype.kind == "i" else False)
-        if len(wrong := np.flatnonzero(beyond)):
-            raise InputError(
-                f"{self._at(first + int(wrong[0]))}: {leaf.name!r} is {values[wrong[0]]}: whole "
-                "numbers beyond 2**53 lose digits; subtract something from the column first, or "
-                "leave it out"
-            )
+    def _check_whole(self, leaf: Leaf, column: pa.Array, first: int) -> None:
+        """Refuse whole numbers that floats lose digits of, as those beside empty cells become."""
+        values = column if leaf.place is None else pc.list_element(column, leaf.place)
+        if pa.types.is_integer(values.type):
+            whole = values.fill_null(0).to_numpy(zero_copy_only=False)
+            check_whole(whole, lambda row: f"{self._at(first + row)}: {leaf.name!r}")
 
     def _seconds(self, leaf: Leaf) -> float:
         """What brings the times to seconds."""
