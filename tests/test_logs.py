@@ -798,6 +798,18 @@ def test_how_an_episode_ends_is_kept_where_its_last_time_is_there_twice(tmp_path
     assert data.episodes["final_observation"].tolist() == [[6]]
 
 
+@pytest.mark.parametrize(("rate", "last"), [(100, 39), (50, 38), (200, 39), (30, 36)])
+def test_an_even_clock_keeps_what_came_after_the_last_action(rate, last, tmp_path):
+    x = np.arange(40.0)
+    rows = {"t": x / 100, "observation": x, "next_observation": x + 1, "action": x}
+    rows["terminated"] = x == 39
+    data = Dataset.from_table(tmp_path / "a", rows, Layout(time="t", rate=rate))
+    assert data.episodes["length"].tolist() == [rate * 0.4]
+    assert data.episodes["terminated"].tolist() == [True]
+    assert data.episodes["final_observation"].tolist() == [[40]]
+    assert data["observation"][-1] == data["action"][-1] == last
+
+
 def test_whole_numbers_in_lists_are_refused_too(tmp_path):
     wide = pa.FixedSizeListArray.from_arrays(pa.array((1 << 53) + np.arange(16) // 2), 2)
     rows = {"x": wide, "u": np.zeros(8), "step": np.arange(8)}

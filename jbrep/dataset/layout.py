@@ -47,7 +47,11 @@ class Layout(Record, frozen=True, kw_only=True):
         str, Meta(description="A column that changes where an episode ends: numbers or words.")
     ] = ""
     terminated: Annotated[
-        str, Meta(description="A column that is true where a state ended the episode.")
+        str,
+        Meta(
+            description="A column that is true where a state ended the episode; without next "
+            "observations it only ends there, truncated."
+        ),
     ] = ""
     units: Annotated[
         Mapping[_Name, str],

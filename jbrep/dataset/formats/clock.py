@@ -1,5 +1,6 @@
 """Rows with times: where episodes end, and rows on an even clock."""
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from typing import Any
@@ -62,8 +63,7 @@ class Clock:
                 begins |= flags(name, flag, ended)
             step = np.diff(rows["time"], prepend=last["time"])
             back, silent = step < 0, step > (self._layout.gap or np.inf)
-            if usual is None and (step > 0).any():
-                usual = float(np.median(step[step > 0]))
+            usual = usual or _usual(step)
             pauses = step >= _PAUSE * (usual or np.inf)
             self._counts["pauses"] += int((pauses & ~begins & ~silent).sum())
             self._counts["back"] += int((back & ~begins).sum())
@@ -97,26 +97,27 @@ class Clock:
         return once
 
     def _resampled(self, rows: Rows) -> Iterator[Rows]:
-        """The rows on an even clock, from where each column has had a reading."""
-        time, rate = rows["time"], self._layout.rate or 1.0
+        """The rows on an even clock, from where each column has had a reading.
+
+        Where it is known what was observed after the last action, the last step leads there.
+        """
+        time, rate, size = rows["time"], self._layout.rate or 1.0, rows["observation"].shape[1]
         values = np.column_stack([rows[name] for name in _SIGNALS if name in rows])
-        known = np.isfinite(values)
-        begin = max(time[some.argmax()] if some.any() else np.inf for some in known.T)
+        known = np.isfinite(values).T
+        begin = max(time[some.argmax()] if some.any() else np.inf for some in known)
         if not np.isfinite(begin):
             self._counts["never"] += len(time)
             return
-        count = int((time[-1] - begin) * rate + _SLACK) + 1
+        final = _final(rows)
+        if final is not None:  # a reading, a usual step later
+            unknown = np.full(values.shape[1] - size, np.nan)
+            values = np.vstack((values, np.append(final, unknown)))
+            time = np.append(time, time[-1] + (_usual(np.diff(time)) or 1 / rate))
+        length = (time[-1] - begin) * rate
+        count = int(length + _SLACK) + 1 if final is None else math.ceil(length - _LATE)
         if count > MOST_RAW:
             raise InputError(f"an episode has {count:,} steps at {rate:g} Hz: give a lower --rate")
-        grid = begin + np.arange(count) / rate
-        size, linear = rows["observation"].shape[1], self._layout.fill == "linear"
-        turning = np.zeros(values.shape[1], bool)
-        turning[:size] = self._angles
-        columns = [
-            self._signal(grid, time[some], column[some], linear and i < size, bool(turning[i]))
-            for i, (some, column) in enumerate(zip(known.T, values.T, strict=True))
-        ]
-        even = np.stack(columns, axis=1)
+        even = self._even(begin + np.arange(count) / rate, time, values)
         whole = np.isfinite(even).all(axis=1)
         self._counts["resampled"] += count
         self._counts["stale"] += int((~whole).sum())
@@ -126,7 +127,26 @@ class Clock:
             part = {"observation": some[:, :size], "action": some[:, size:]}
             if "reward" in rows:
                 part |= {"action": some[:, size:-1], "reward": some[:, -1]}
+            if final is not None and end == count:
+                is_last = np.arange(first, end) == end - 1
+                part |= {name: is_last & bool(rows[name][-1]) for name in ENDS if name in rows}
+                part["next_observation"] = np.vstack((part["observation"][1:], final))
             yield part
+
+    def _even(self, grid: Array, time: Array, values: Array) -> Array:
+        """Columns on the clock, (n, c), of their readings at other times; NaN where they have none.
+
+        Those of observations come first.
+        """
+        size, linear = len(self._angles), self._layout.fill == "linear"
+        columns = list[Array]()
+        for i, column in enumerate(values.T):
+            some = np.isfinite(column)
+            turning = i < size and bool(self._angles[i])
+            columns.append(
+                self._signal(grid, time[some], column[some], linear and i < size, turning)
+            )
+        return np.stack(columns, axis=1)
 
     def _signal(
         self, grid: Array, time: Array, values: Array, linear: bool, turning: bool
@@ -147,6 +167,20 @@ class Clock:
             even = values[last].astype(float)
         even[age > (self._layout.gap or np.inf) + slack] = np.nan
         return even
+
+
+def _final(rows: Rows) -> Array | None:
+    """What was observed after the last action of an episode, (d,), if all of it is known."""
+    if "next_observation" not in rows or not np.isfinite(rows["next_observation"][-1]).all():
+        return None
+    last: Array = rows["next_observation"][-1]
+    return last
+
+
+def _usual(steps: Array) -> float | None:
+    """The median of the steps on, if there are any."""
+    forward = steps[steps > 0]
+    return float(np.median(forward)) if len(forward) else None
 
 
 def timestep_of(time: Array) -> float | None:
