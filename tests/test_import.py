@@ -215,6 +215,33 @@ def test_an_episode_may_have_ended_in_both_ways(to, tmp_path):
         assert each.episodes["truncated"].tolist() == [1, 1, 0]
 
 
+def test_what_is_hidden_or_rewarded_otherwise_goes_to_minari(collected, tmp_path, monkeypatch):
+    """Beside the whole; without the environment, which shows more."""
+    (tmp_path / "mine.py").write_text(
+        "def reward(observations, actions):\n    return 9 + actions[:, 0]"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    hide = ("--hide", "*velocity*")
+    assert jbrep("data", "derive", collected, *hide, "--out", "seen").exit_code == 0
+    reward = ("--reward", "mine:reward")
+    assert jbrep("data", "derive", collected, *reward, "--out", "rewarded").exit_code == 0
+    export(Dataset(collected), "minari", tmp_path / "out")
+    export(Dataset("seen"), "minari", tmp_path / "out")
+    export(Dataset("rewarded"), "minari", tmp_path / "own")
+    (hidden,) = (tmp_path / "out").glob("jitterbug/*without*/uniform-v0")
+    assert "env_spec" not in json.loads((hidden / "data/metadata.json").read_text())
+    assert import_data(str(hidden), tmp_path / "back") == "it names no environment"
+    np.testing.assert_array_equal(
+        Dataset(tmp_path / "back")["observation"], Dataset("seen")["observation"]
+    )
+    (own,) = (tmp_path / "own").glob("**/uniform-v0")
+    import_data(str(own), tmp_path / "again")
+    again = Dataset(tmp_path / "again")
+    np.testing.assert_array_equal(again["reward"], Dataset("rewarded")["reward"])
+    assert (again.task.name, again.task.reward_high) == (Dataset(collected).task.name, None)
+
+
 def test_seeds_that_are_not_known_stay_so(written, tmp_path):
     export(written, "minari", tmp_path)
     exported = tmp_path / written.task.slug / "imported-v0"

@@ -652,6 +652,12 @@ def test_a_clock_that_is_rounded_keeps_every_row(tmp_path, rate, digits):
     assert data.task.timestep == 1 / rate
 
 
+def test_steps_of_which_none_is_usual_are_no_even_clock(tmp_path):
+    table = {"t": [0, 0.0089, 0.02], "x": np.arange(3.0), "u": np.zeros(3)}
+    layout = Layout(observations=("x",), actions=("u",), time="t")
+    assert Dataset.from_table(tmp_path / "a", table, layout).task.timestep is None
+
+
 def test_linear_readings_at_a_tick_are_kept_before_a_gap(tmp_path):
     x = np.array([0, 1, 2, *[np.nan] * 4, 7, 8, 9])
     table = {"t": np.arange(10) / 10, "x": x, "u": np.zeros(10)}

@@ -192,7 +192,7 @@ def timestep_of(time: Array) -> float | None:
     low, median, high = np.percentile(steps, (5, 50, 95))
     even = (1 - _EVEN) * median <= low and high <= (1 + _EVEN) * median
     usual = steps[np.abs(steps - median) <= _EVEN * median]
-    return _rounded(float(usual.mean())) if even else None
+    return _rounded(float(usual.mean())) if even and len(usual) else None
 
 
 def _rounded(step: float) -> float:

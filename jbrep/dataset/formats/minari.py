@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import minari
 import minari.dataset.minari_storage as storages
@@ -24,12 +24,14 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces.utils import flatten
 from minari.data_collector import EpisodeBuffer
 from minari.namespace import NAMESPACE_METADATA_FILENAME
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 import jbrep.jitterbug.simulation  # noqa: F401  Minari makes the environment: load MuJoCo before
 from jbrep.dataset.formats.episodes import Incoming, Source, check_kind, label, whole_episode
 from jbrep.dataset.formats.hdf5 import opened
 from jbrep.dataset.reader import Dataset
+from jbrep.dataset.rewards import without_range
 from jbrep.dataset.schema import UNKNOWN_SEED, DataSettings
 from jbrep.dataset.settings import Digest
 from jbrep.envs.description import describe, features_of
@@ -59,13 +61,17 @@ EPISODE_BYTES = 1 << 14  # that HDF5 takes for each episode besides its rows
 
 
 class Checksums(Document, frozen=True, kw_only=True):
-    """jbrep.json: the SHA-256 of each file that was exported, by its name, and offsets, (d,)."""
+    """jbrep.json: the SHA-256 of each file that was exported, by its name, and what Minari lacks.
+
+    That is the offsets of features, (d,), and whether the rewards aren't the environment's.
+    """
 
     format = "jbrep export"
     format_version = 1
 
     files: Mapping[str, Digest]
     offsets: tuple[Finite, ...] = ()
+    own_rewards: Literal[True] | UnsetType = UNSET
 
 
 def open_source(given: str) -> Source:
@@ -90,6 +96,8 @@ def open_source(given: str) -> Source:
     identity = env_id or label(name)
     if task and (task.size, task.action_size) != (len(features), actions.low.size):
         task, identity, why_not = None, label(name), f"{env_id} has other sizes"
+    if task and exported and exported.own_rewards:
+        task = without_range(task)
     return Source(
         name,
         identity,
@@ -282,7 +290,7 @@ def write(dataset: Dataset, out: Path) -> str:
         with _datasets_in(root.resolve()), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on the missing author and address
             _create(dataset, name, spec)
-        _write_checksums(root / name / "data", dataset.task)
+        _write_checksums(root / name / "data", settings)
         for namespace in Path(name).parents[:-1]:
             metadata = namespace / NAMESPACE_METADATA_FILENAME
             if not exists(out / metadata):
@@ -291,17 +299,17 @@ def write(dataset: Dataset, out: Path) -> str:
     return f"{_ROOT}={out} and minari.load_dataset({name!r})"
 
 
-def _write_checksums(folder: Path, task: Task) -> None:
+def _write_checksums(folder: Path, settings: DataSettings) -> None:
     files = {path.name: _sha256(path) for path in sorted(folder.iterdir())}
-    offsets = tuple(task.offset.tolist()) if task.offset.any() else ()
-    Checksums(files=files, offsets=offsets).write(folder / _CHECKSUMS)
+    offsets = tuple(settings.task.offset.tolist()) if settings.task.offset.any() else ()
+    known = Checksums(files=files, offsets=offsets, own_rewards=True if settings.reward else UNSET)
+    known.write(folder / _CHECKSUMS)
 
 
 def _namespace(task: Task) -> str:
-    """Jitterbug's tasks stand together; another's id has no version there."""
-    if task.id.startswith("Jitterbug/"):
-        return f"jitterbug/{task.slug}"
-    name = re.sub(r"[^A-Za-z0-9_/-]+", "-", task.id)
+    """Jitterbug's tasks stand together; another's name has no version there."""
+    name = f"jitterbug/{task.slug}" if task.id.startswith("Jitterbug/") else task.name
+    name = re.sub(r"[^A-Za-z0-9_/-]+", "-", name)
     return name if len(name) > 1 else f"task-{name}"  # Minari takes no single letter
 
 
@@ -325,10 +333,12 @@ def _env_spec(settings: DataSettings) -> EnvSpec | None:
     """What Minari recovers the environment from: with the arguments and the time limit.
 
     None for one that was registered with a class or function: only a name can be written down.
-    None, too, for imported data of one that isn't there, and where offsets are subtracted from what
-    the environment gives.
+    None, too, for imported data of one that isn't there, and where observations are others than
+    what the environment gives: by offsets, or by what is seen of it.
     """
     task = settings.task
+    if task.view or task.offset.any():
+        return None
     try:
         spec = copy.deepcopy(spec_of(task))
     except (InputError, ModuleNotFoundError):
@@ -337,7 +347,7 @@ def _env_spec(settings: DataSettings) -> EnvSpec | None:
         raise
     spec.kwargs.update(task.arguments)
     spec.max_episode_steps = task.max_episode_steps
-    return None if callable(spec.entry_point) or task.offset.any() else spec
+    return None if callable(spec.entry_point) else spec
 
 
 @contextmanager
