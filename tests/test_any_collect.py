@@ -322,7 +322,7 @@ def test_reading_makes_no_environment(tmp_path, monkeypatch):
     assert "Hopper-v5, 11 features, 3 actions" in jbrep("data", "info", folder).output
     assert jbrep("data", "info", folder, "--json").exit_code == 0
     for to in ("npz", "parquet"):
-        export(dataset, to, tmp_path / to)
+        export(dataset, to, tmp_path / f"it.{to}")
 
 
 def test_a_data_set_whose_package_isn_t_imported(sledges, tmp_path, monkeypatch):

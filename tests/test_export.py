@@ -152,11 +152,18 @@ def test_an_export_has_a_name(name, dataset):
             export(dataset, to, Path(name))
 
 
+def test_an_exported_file_ends_as_its_format_does(dataset, tmp_path):
+    for to, name in (("npz", "face"), ("parquet", "face.v2"), ("npz", "face.parquet")):
+        with pytest.raises(InputError, match=rf"{name} must end in \.{to}, by which"):
+            export(dataset, to, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
 def test_nothing_is_overwritten_and_no_half_is_left(dataset, tmp_path, monkeypatch):
     for to in FORMATS:
-        export(dataset, to, tmp_path / to)
+        export(dataset, to, tmp_path / f"it.{to}")
         with pytest.raises(InputError, match="exists already"):
-            export(dataset, to, tmp_path / to)
+            export(dataset, to, tmp_path / f"it.{to}")
     with pytest.raises(InputError, match="unknown format 'csv': choose one of minari, parquet"):
         export(dataset, "csv", tmp_path / "x")
 
@@ -167,7 +174,7 @@ def test_nothing_is_overwritten_and_no_half_is_left(dataset, tmp_path, monkeypat
     monkeypatch.setattr("jbrep.dataset.columns.Column.__getitem__", fail)
     for to in FORMATS:
         with pytest.raises(InputError, match=r"can't write .*: No space left on device"):
-            export(dataset, to, tmp_path / "new" / to)
+            export(dataset, to, tmp_path / "new" / f"it.{to}")
     assert not [path.name for path in (tmp_path / "new").rglob("*") if path.is_file()]
 
 
@@ -175,9 +182,9 @@ FOLDERS = dict.fromkeys(("minari", "lerobot"), "folder")
 
 
 def exported(to, folder):
-    """What an export to `folder / to` writes: its files, or the folder of its data set."""
-    minari = folder / "minari" / "jitterbug" / "face_direction" / "uniform-v0"
-    return minari if to == "minari" else folder / to
+    """What an export to it.FORMAT writes: its files, or the folder of its data set."""
+    out = folder / f"it.{to}"
+    return out / "jitterbug/face_direction/uniform-v0" if to == "minari" else out
 
 
 @pytest.mark.parametrize("to", FORMATS)
@@ -196,7 +203,7 @@ def test_what_came_after_the_check_is_not_overwritten(to, dataset, tmp_path, mon
 
     monkeypatch.setattr(publish, come_first)
     with pytest.raises(InputError, match=r"exists already|can't write .*: Directory not empty"):
-        export(dataset, to, tmp_path / to)
+        export(dataset, to, tmp_path / f"it.{to}")
     (left,) = (p for p in tmp_path.rglob("*") if p.is_file() and "namespace" not in p.name)
     assert left.read_text() == "precious"
 
@@ -220,7 +227,7 @@ export(Dataset(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))
 
 @pytest.mark.parametrize("to", FORMATS)
 def test_a_killed_export_leaves_nothing_under_the_final_name(to, dataset, tmp_path):
-    out = tmp_path / to
+    out = tmp_path / f"it.{to}"
     command = [sys.executable, "-W", "ignore", "-c", KILLED, dataset.folder, to, out]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     assert not exported(to, tmp_path).exists()
@@ -278,9 +285,9 @@ def test_an_export_is_on_the_disk_and_has_one_writer(to, dataset, tmp_path, monk
         exclusive(path, beside=True),
         pytest.raises(InputError, match="is being written by process"),
     ):
-        export(dataset, to, tmp_path / to)
+        export(dataset, to, tmp_path / f"it.{to}")
     assert not synced
-    export(dataset, to, tmp_path / to)
+    export(dataset, to, tmp_path / f"it.{to}")
     for written in (path.parent, path, *path.rglob("*")):
         assert written.stat().st_ino in synced, written
 

@@ -351,6 +351,9 @@ def test_several_logs_are_an_episode_each(tmp_path):
     told, data = imported(first, second, *NAMED, "--length", "100")
     assert data.episodes["length"].tolist() == [99, 19, 99, 19]
     assert "240 rows read" in told
+    (tmp_path / "c.csv").symlink_to(first)
+    said = mistake("data", "import", first, second, tmp_path / "c.csv", *NAMED, "--out", "no")
+    assert "c.csv is given twice: its episodes would be there twice" in said
     assert math.isclose(data.task.action_high[0], VOLTS.max(), rel_tol=1e-4)
 
 

@@ -239,7 +239,7 @@ def derive(
 @_data
 @import_option
 @click.option("--to", required=True, help="minari, parquet, npz or lerobot.")
-@click.option("--out", required=True, type=PATH, help="A new file or folder.")
+@click.option("--out", required=True, type=PATH, help="A new folder, or a file that ends in .npz or .parquet.")
 def export(data: Path, to: str, out: Path) -> None:
     """Write a data set in another tool's format.
 
@@ -273,7 +273,7 @@ def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
     is made from the data alone. See docs/logs.md, and docs/data-format.md for what is known by its
     name.
     """
-    from jbrep.dataset.formats import open_source, together
+    from jbrep.dataset.formats import open_sources
     from jbrep.dataset.formats.writer import write
     from jbrep.envs.names import import_code, is_code
 
@@ -292,7 +292,7 @@ def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
     with stoppable("nothing was imported"):
         with deferred_stop():
             missing = told["missing"] or (task.missing if task else "") or ""
-            opened = together([open_source(each, layout, missing) for each in source])
+            opened = open_sources(source, layout, missing)
         said = {} if task else _given(told)
         manifest = write(opened, out, task, **said, reward=reward)
     for note in opened.notes:

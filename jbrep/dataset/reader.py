@@ -215,9 +215,9 @@ class Dataset:
             InputError: the folder exists already, or the files can't be used.
             ModuleNotFoundError: their format needs a package that isn't installed.
         """
-        from jbrep.dataset.formats import open_source, together
+        from jbrep.dataset.formats import open_sources
 
-        opened = together([open_source(str(each), layout, missing) for each in (file, *more)])
+        opened = open_sources([*map(str, (file, *more))], layout, missing)
         return _written(folder, opened, layout, missing, task)
 
     def _shard(self, shard: int) -> Columns:

@@ -62,15 +62,19 @@ def export(dataset: "Dataset", to: str, out: Path) -> str:
     Args:
         dataset: what to write.
         to: a key of `FORMATS`.
-        out: a new file; for Minari a folder of Minari data sets, new or not.
+        out: a new file, which ends as its format does, or a folder; for Minari a folder of Minari
+            data sets, new or not.
 
     Returns:
         How to open it.
 
     Raises:
-        InputError: an unknown format, no rows, something there already, or it can't be written.
+        InputError: an unknown format, no rows, another ending, something there already, or it can't
+            be written.
     """
     module = load_format(to)
+    if out.name and to in _FILES and out.suffix.lower() != f".{to}":
+        raise InputError(f"{out} must end in .{to}, by which jbrep data import knows the format")
     if not len(dataset):
         raise InputError(f"{dataset.folder} has no rows yet")
     try:
@@ -85,6 +89,19 @@ def export(dataset: "Dataset", to: str, out: Path) -> str:
         reason = getattr(error, "strerror", None) or error  # some have only a text
         raise InputError(f"can't write {out}: {reason}") from error
     return how
+
+
+def open_sources(given: Sequence[str], layout: Layout | None = None, missing: str = "") -> Source:
+    """Open what is to be imported together, each as `open_source` does.
+
+    Raises:
+        InputError: two are the same; or as `open_source` and `together`.
+    """
+    paths = [Path(each).resolve() for each in given]
+    for i, path in enumerate(paths):
+        if path in paths[:i]:
+            raise InputError(f"{given[i]} is given twice: its episodes would be there twice")
+    return together([open_source(each, layout, missing) for each in given])
 
 
 def open_source(given: str, layout: Layout | None = None, missing: str = "") -> Source:
