@@ -98,6 +98,17 @@ def test_missing_cells_are_cut_or_held_and_counted(tmp_path):
     told, data = imported(path, *NAMED, "--gap", "1", "--missing", "hold:2", out="held")
     np.testing.assert_allclose(data["gyro"][29:33], [8.29, 8.29, 8.29, 8.32], rtol=1e-6)
     assert data.episodes["missing"].tolist() == [2, 0]
+    turns = {"x": [0, 1, "", 3, "", 5], "y": [0, "", 2, "", 4, ""], "u": [0.5] * 6}
+    path, names = write_csv(tmp_path / "b.csv", turns), ("--actions", "u", "--length", "9")
+    _, data = imported(path, *names, "--missing", "hold:1", out="turns")
+    assert data["observation"][:].tolist() == [[0, 0], [1, 0], [1, 2], [3, 2], [3, 4]]
+    for column, cells, told in (
+        ("x", ["", *range(5)], "feature 0 is missing at step 0, with none before to hold: give"),
+        ("u", [0, 1, "", 3, 4, 5], "lacks its action at step 2, which can't be held: leave"),
+    ):
+        write_csv(path, turns | {column: cells})
+        command = ("data", "import", path, *names, "--missing", "hold:1", "--out", tmp_path / "no")
+        assert told in mistake(*command)
 
 
 def test_uneven_clocks_are_brought_to_an_even_one(tmp_path):

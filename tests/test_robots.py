@@ -454,7 +454,8 @@ def test_missing_readings_of_a_log(tmp_path):
     features.write_text('[[features]]\nname = "clock"\noffset = 1764000000\n[[features]]\n')
     command = ("data", "import", log, "--out", tmp_path / "data")
     assert "isn't finite, or beyond 32 bits, at step 7" in mistake(*command)
-    assert "isn't finite, at step 11" in mistake(*command, "--missing", "hold:1")
+    told = mistake(*command, "--missing", "hold:1")
+    assert "feature 1 is missing at step 11, beyond hold:1 of the last one: hold it for" in told
     told = jbrep(*command, "--missing", "hold:2")
     assert "log.npz had 3 missing readings (hold:2)" in told.stderr
     assert "obs_0 is near 1764000000 and changes by about 0.02" in told.stderr

@@ -239,7 +239,9 @@ def derive(
 @_data
 @import_option
 @click.option("--to", required=True, help="minari, parquet, npz or lerobot.")
-@click.option("--out", required=True, type=PATH, help="A new folder, or a file that ends in .npz or .parquet.")
+@click.option(
+    "--out", required=True, type=PATH, help="A new folder, or a file that ends in .npz or .parquet."
+)
 def export(data: Path, to: str, out: Path) -> None:
     """Write a data set in another tool's format.
 

@@ -79,28 +79,27 @@ def _whole_parts(episode: Incoming) -> Iterator[Incoming]:
 
 def _held(episode: Incoming, most: int) -> Incoming:
     """The episode with the last numbers in place of missing ones; an action has none."""
+    if not (whole := np.isfinite(episode.action).all(axis=1)).all():
+        raise InputError(
+            f"{episode.where} lacks its action at step {int(np.flatnonzero(~whole)[0])}, which "
+            "can't be held: leave the episode out, or give --missing skip"
+        )
     seen = np.concatenate((episode.observation, episode.final[None]))
     reward = np.concatenate(([0.0], episode.reward))  # with the observation after it
     rows = np.column_stack((seen, reward))
-    is_missing: NDArray[np.bool_] = (~np.isfinite(rows)).any(axis=1)
-    since = np.arange(len(rows)) - np.maximum.accumulate(
-        np.where(is_missing, -1, np.arange(len(rows)))
-    )
-    wrong = is_missing & (since > most)
-    if is_missing[0] or wrong.any():
-        step = 0 if is_missing[0] else int(np.flatnonzero(wrong)[0])
-        raise _not_finite(episode.where, "observation or reward", step)
-    if not (whole := np.isfinite(episode.action).all(axis=1)).all():
-        raise _not_finite(episode.where, "action", int(np.flatnonzero(~whole)[0]))
-    last = np.maximum.accumulate(np.where(np.isfinite(rows), np.arange(len(rows))[:, None], 0))
+    number = np.arange(len(rows))[:, None]
+    last = np.maximum.accumulate(np.where(np.isfinite(rows), number, -1))
+    if len(wrong := np.argwhere((last < 0) | (number - last > most))):
+        step, column = wrong[0]
+        what = "the reward" if column == seen.shape[1] else f"feature {column}"
+        is_first = last[step, column] < 0
+        why = "with none before to hold" if is_first else f"beyond hold:{most} of the last one"
+        raise InputError(
+            f"{episode.where}: {what} is missing at step {step}, {why}: "
+            f"{'' if is_first else 'hold it for longer, '}give --missing skip, or leave the "
+            "episode out"
+        )
     filled = np.take_along_axis(rows, last, axis=0)
     return episode._replace(
         observation=filled[:-1, :-1], final=filled[-1, :-1], reward=filled[1:, -1]
-    )
-
-
-def _not_finite(where: str, what: str, step: int) -> InputError:
-    return InputError(
-        f"{where} has a number in its {what} that isn't finite, at step {step}: correct the data, "
-        "leave the episode out, or say by --missing what becomes of it"
     )
