@@ -280,6 +280,12 @@ def test_rewards_may_be_missing_in_an_npz_file(tmp_path):
     assert "reward" not in Dataset(tmp_path / "data").columns
 
 
+def test_a_unit_of_an_npz_file_that_is_no_unit(tmp_path):
+    d4rl(tmp_path / "a.npz", feature_names=[*"abc"], feature_units=["", "m" * 41, ""])
+    with pytest.raises(InputError, match=r"a\.npz, feature b: unit is 'mmm"):
+        import_data(str(tmp_path / "a.npz"), tmp_path / "data")
+
+
 @pytest.mark.parametrize("to", ["parquet", "npz", "minari"])
 def test_offsets_are_subtracted_once(to, tmp_path):
     (tmp_path / "f.toml").write_text("[[features]]\noffset = 5.0\n[[features]]\n[[features]]\n")

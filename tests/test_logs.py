@@ -185,6 +185,8 @@ def upright(observations, actions):
     return np.cos(observations[:, 0]) - 0.01 * (actions**2).sum(axis=1)
 def scalar(observations, actions):
     return 1.0
+def turning(observations, actions):
+    return np.ones(len(actions)) * 1j
 def endless(observations, actions):
     return np.where(np.arange(len(actions)) == 7, np.inf, 0)
 """
@@ -237,6 +239,7 @@ def test_rewards_for_data_that_exist_already(tmp_path, rewards):
     derive = ("data", "derive", tmp_path / "collected", "--out")
     for name, problem in {
         "my_rewards:scalar": "gives an array of shape () for 30 steps: it must be (30,)",
+        "my_rewards:turning": "fails: TypeError: it gives complex numbers",
         "my_rewards:endless": "gives inf at step 7 of an episode: it must be finite",
         "my_rewards:fly": "has no attribute 'fly'",
         "upright": "--reward upright must be MODULE:FUNCTION",
@@ -307,6 +310,7 @@ BAD = {
     "--hide and --history need a --task here": ({}, (*NAMED, "--hide", "gyro")),
     "of a log name the column of times": ({}, NAMED[:4]),
     "fill is 'cubic': it must be": ({}, (*NAMED, "--fill", "cubic")),
+    "--fill linear needs --rate": ({}, (*NAMED, "--fill", "linear")),
     "can't be read as rows of text: field larger": ({"status": {3: "a" * 200_000}}, NAMED),
 }
 
@@ -477,6 +481,9 @@ def test_a_header_may_follow_many_comments_and_rows_may_all_be_apart(tmp_path):
     assert len(imported(path, *how)[1]) == 2
     told = mistake("data", "import", path, *how, "--gap", "0.5", "--out", tmp_path / "apart")
     assert "has no step: an episode needs two rows" in told
+    path.write_text("t,x,u\n" + "5,1,2\n" * 9)
+    told = mistake("data", "import", path, *how, "--out", tmp_path / "still")
+    assert "; 8 rows at the time of the row before: left out" in told
 
 
 def test_a_pause_within_an_episode_is_told(tmp_path):
@@ -569,6 +576,15 @@ def test_names_that_tell_no_joints_apart_are_numbers(joints, tmp_path):
     _, data = imported(path, *names, "--rate", "100", "--gap", "0.15")
     assert data.task.feature_names == ("joint_states.position.0", "joint_states.position.1")
     assert data["observation"][5].tolist() != [0, 0]
+
+
+def test_numbers_that_come_late_in_a_bag_are_missed_if_they_are_asked_for(tmp_path):
+    path = write_bag(tmp_path / "walk", "mcap", silent=range(220))
+    how = ("--actions", "/arm/command.data", "--rate", "50", "--observations")
+    assert len(imported(path, *how, "/joint_states.header.stamp.sec")[1])
+    told = mistake("data", "import", path, *how, "/joint_states.*", "--out", tmp_path / "no")
+    assert "/joint_states.position" in told
+    assert "is in none of its first 200 messages" in told
 
 
 def test_messages_without_numbers_end_no_bag(tmp_path):
@@ -743,6 +759,18 @@ def test_empty_lines_are_no_rows_and_count_as_lines(tmp_path):
     path.write_text("# a\n\nt,x,u\n0,1,2\n\n1,2,3\n2,,3\n")
     done = jbrep("data", "import", path, "--time", "t", "--actions", "u", "--out", tmp_path / "no")
     assert "a.csv, line 7: 'x' is empty" in done.output
+    text = '# a\n\nt,x,u,note\n0,1,2,"a\nb"\n\n1,2,3,"c\n\nd"\n'
+    for row, told in {
+        "2,,3,e": "a.csv, line 10: 'x' is empty",
+        "2,fast,3,e": "a.csv, line 10, column 'x': invalid value 'fast'",
+        "2,3,4,e,f": "a.csv, line 10: expected 4 columns, got 5",
+    }.items():
+        path.write_text(f"{text}{row}\n")
+        how = ("--observations", "x", "--actions", "u", "--time", "t", "--out", tmp_path / "no")
+        assert told in mistake("data", "import", path, *how)
+    rows = "".join(f'{i},{i},2,"{i}\n"\n' for i in range(99_999))
+    path.write_text(f"t,x,u,note\n{rows}9,fast,1,\n")
+    assert "line 200000, column 'x': invalid value" in mistake("data", "import", path, *how)
 
 
 def test_a_folder_of_lerobot_s_that_lacks_rows_is_refused(tmp_path):

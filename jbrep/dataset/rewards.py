@@ -30,7 +30,10 @@ def reward_function(code: str) -> Callable[[Array, Array], NDArray[np.float64]]:
 
     def rewards(observations: Array, actions: Array) -> NDArray[np.float64]:
         try:
-            given = np.asarray(function(observations.copy(), actions.copy()), float)
+            made = function(observations.copy(), actions.copy())
+            if np.iscomplexobj(made):
+                raise TypeError("it gives complex numbers")
+            given = np.asarray(made, float)
         except Exception as error:
             raise InputError(f"the reward {code} fails: {kind_and_line(error)}") from error
         if given.shape != (len(actions),):

@@ -46,7 +46,7 @@ def open_table(given: str) -> Table:
     Raises:
         InputError: it can't be read.
     """
-    path, columns, unknown = Path(given), list[str](), list[str]()
+    path, columns, unknown, late = Path(given), list[str](), list[str](), dict[str, str]()
     with _opened(path) as reader:
         for topic in sorted(reader.topics):
             messages = islice(_messages(reader, {topic}), _PEEKED)
@@ -59,7 +59,8 @@ def open_table(given: str) -> Table:
         given,
         label(path.stem),
         schema,
-        lambda names: _batches(path, schema, names),
+        lambda names: _batches(path, schema, names, late),
+        late=late,
         layout=Layout(time=_TIME),
         is_sparse=True,
         notes=(f"no numbers known in {', '.join(unknown)}",) if unknown else (),
@@ -115,19 +116,19 @@ def _tell_apart(names: Any, count: int) -> bool:
     return len({*names}) == len(names) == count
 
 
-def _batches(path: Path, schema: pa.Schema, names: list[str]) -> Iterator[pa.RecordBatch]:
-    """The messages with some of the numbers, some at a time."""
+def _batches(
+    path: Path, schema: pa.Schema, names: list[str], late: dict[str, str]
+) -> Iterator[pa.RecordBatch]:
+    """The messages with some of the numbers, some at a time; what is late is added, see `Table`."""
     known = {*schema.names}
     with _opened(path) as reader:
         topics = {t for t in reader.topics if any(name.startswith(f"{t}.") for name in names)}
         messages = (each for each in _messages(reader, topics) if each.numbers)
         while some := list(islice(messages, CHUNK)):
             for message in some:
-                if new := message.numbers.keys() - known:
-                    raise InputError(
-                        f"{path}, {message.place}: {min(new)} is in none of its first {_PEEKED} "
-                        "messages"
-                    )
+                for name in message.numbers.keys() - known - late.keys():
+                    place = f"{path}, {message.place}"
+                    late[name] = f"{place}: {name} is in none of its first {_PEEKED} messages"
             columns = [
                 pa.array([each.time for each in some], pa.timestamp("ns"))
                 if name == _TIME

@@ -4,6 +4,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -61,15 +62,22 @@ def open_table(given: str) -> Table:
         label(path.stem),
         schema,
         lambda columns: _batches(path, form, schema, columns),
-        place=lambda row: f"line {_line_of(path, form.begin, row)}",
+        place=lambda row: f"line {_line_of(path, form, row)}",
     )
 
 
-def _line_of(path: Path, begin: int, row: int) -> int:
-    """The line of a row, from 1; empty lines are none."""
-    with path.open(encoding="utf-8-sig", newline=None) as file:
-        lines = (i for i, line in enumerate(file, 1) if i > begin and line.strip("\n"))
-        return next(islice(lines, row, None), begin + 1 + row)
+def _line_of(path: Path, form: _Form, row: int) -> int:
+    """The line in which a row begins, from 1; empty lines are no rows."""
+    line = form.begin + 1
+    with path.open(encoding="utf-8-sig", newline=None, errors="replace") as file:
+        rows = csv.reader(islice(file, form.begin, None), delimiter=form.separator)
+        with suppress(csv.Error):
+            for cells in rows:
+                if cells and not row:
+                    break
+                row -= bool(cells)
+                line = form.begin + rows.line_num + 1
+    return line + row
 
 
 def _form(path: Path) -> _Form:
@@ -171,7 +179,7 @@ def _batches(
                 skip_rows=form.begin,
                 column_names=form.names,
             ),
-            pa_csv.ParseOptions(delimiter=form.separator),
+            pa_csv.ParseOptions(delimiter=form.separator, newlines_in_values=True),
             pa_csv.ConvertOptions(
                 column_types=schema,
                 include_columns=columns,
@@ -188,10 +196,13 @@ def _batches(
 def _line(path: Path, form: _Form, error: BaseException) -> str:
     """An error of Arrow's, with row and column."""
     text = first_line(error)
+
+    def place(number: str | None) -> str:  # of a row, counted on from the lines before the first
+        row = int(number or 0) - form.begin - 1
+        return f", line {_line_of(path, form, row)}" if number else ""
+
     if found := _PROBLEM.fullmatch(text):
-        place = f", line {found[2]}" if found[2] else ""
-        return f"{path}{place}, column {form.names[int(found[1])]!r}: {found[3]}"
+        return f"{path}{place(found[2])}, column {form.names[int(found[1])]!r}: {found[3]}"
     if found := _SHORT.match(text):
-        place = f", line {found[1]}" if found[1] else ""
-        return f"{path}{place}: {found[2].lower()}"
+        return f"{path}{place(found[1])}: {found[2].lower()}"
     return f"{path} can't be read as rows of text: {text}"

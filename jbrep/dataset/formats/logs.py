@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -90,6 +91,8 @@ def _both(table: Table, given: Layout) -> Layout:
     for name in ("gap", "rate"):
         if getattr(layout, name) and not layout.time:
             raise InputError(f"--{name} needs --time, the column of times")
+    if layout.fill != usual.fill and not layout.rate:
+        raise InputError(f"--fill {layout.fill} needs --rate: else nothing stands between readings")
     if table.is_sparse and not (layout.observations and layout.actions and layout.rate):
         names = [name for name in table.schema.names if name != layout.time]
         raise InputError(
@@ -151,6 +154,7 @@ class _Reader:
         """The rows by role, some at a time."""
         first, origin, labels = 0, None, dict[Any, int]()
         for batch in self._table.batches(self._columns):
+            self._check_late()
             arrays = {name: self._numbers(batch, name, first) for name in self._columns}
             rows = dict[str, Array]()
             for role, leaves in self._roles.items():
@@ -178,6 +182,13 @@ class _Reader:
             first += batch.num_rows
             self._counts["rows"] += batch.num_rows
             yield rows
+
+    def _check_late(self) -> None:
+        """Refuse what came up too late, if it was asked for."""
+        asked = (*self._layout.observations, *self._layout.actions)
+        for name, problem in self._table.late.items():
+            if any(fnmatchcase(name, pattern) for pattern in asked):
+                raise InputError(problem)
 
     def _check(self, leaf: Leaf, role: str, values: Array, first: int) -> None:
         """Refuse a number that is missing where none may be."""

@@ -190,7 +190,13 @@ def _features(archive: zipfile.ZipFile, names: Collection[str]) -> tuple[Feature
     if units and len(units) != len(given):
         has = f"{len(given)} feature names and {len(units)} units"
         raise InputError(f"{archive.filename} has {has}")
-    return tuple(map(Feature, words(given), units or [""] * len(given)))
+    features = list[Feature]()
+    for name, unit in zip(words(given), units or [""] * len(given), strict=True):
+        try:
+            features.append(Feature(name, unit))
+        except InputError as error:
+            raise InputError(f"{archive.filename}, feature {name}: {error}") from None
+    return tuple(features)
 
 
 def write(dataset: Dataset, out: Path) -> str:

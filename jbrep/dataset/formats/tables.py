@@ -52,6 +52,8 @@ class Table:
         place: what a row is called in messages, by its number from 0.
         timestep: of its clock, if its format says it [s].
         is_sparse: whether a row has numbers of some columns only.
+        late: of columns that came up after the schema was known, what is wrong with them, for
+            messages: they can't be used.
         notes: on what its format leaves out.
     """
 
@@ -67,6 +69,7 @@ class Table:
     place: Callable[[int], str] = lambda row: f"row {row}"
     timestep: float | None = None
     is_sparse: bool = False
+    late: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
 

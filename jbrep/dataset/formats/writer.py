@@ -153,9 +153,10 @@ def _survey(source: Source, missing: str) -> _Survey:
     if signals is None:
         if source.rows == 0:
             raise InputError(f"{source.name} has no rows")
+        done = (f"; {counted(n, noun)} {what}" for (noun, what), n in source.changes().items())
         raise InputError(
             f"{source.name} has no step: an episode needs two rows, as the last one only says what "
-            "was observed after the last action"
+            f"was observed after the last action{''.join(done)}"
         )
     low, high = low.astype(np.float32), high.astype(np.float32)
     return _Survey(lengths, sizes[0], low, high, signals)
