@@ -229,6 +229,45 @@ def test_nothing_is_said_where_it_cannot_be(evaluation):
     assert evaluation.encoders["without load"].method == {"spectrum": [3.0, 1.0]}
 
 
+def test_the_nearest_code_tells_something_and_lacks_nothing_if_one_does(evaluation):
+    def telling(label, r2, loses=()):
+        known = evaluation.encoders[label]
+        ahead = known.prediction["10"].replace(rewarded=Score(r2, None, None))
+        return known.replace(prediction=known.prediction | {"10": ahead}, loses=loses)
+
+    lost = evaluation.encoders["without load"].loses
+    codes = {"full": telling("full", 0.9), "a": telling("noise", 0.4, lost)}
+    codes |= {"b": telling("noise", 0.3), "c": telling("noise", 0.05)}
+    told = evaluation_text(evaluation.replace(encoders=codes))
+    assert "observation does. b comes nearest: it tells the change" in told
+    assert re.search(
+        r"\nc +nothing: it can all be read now, but what becomes of it less well", told
+    )
+    del codes["b"]
+    assert "a comes nearest" in serving(evaluation.replace(encoders=codes))
+    del codes["a"]
+    assert serving(evaluation.replace(encoders=codes)) == (
+        "No code should serve as the full observation does: none tells the change of what the "
+        "reward depends on over the next 10 steps with more than an R² of 0.05 (the full one: "
+        "0.90)."
+    )
+
+
+def test_of_short_episodes_as_many_steps_count_as_are_known(evaluation):
+    shorter = {
+        label: known.replace(prediction={k: known.prediction[k] for k in ("1", "5")})
+        for label, known in evaluation.encoders.items()
+    }
+    told = evaluation_text(evaluation.replace(encoders=shorter), everything=True)
+    assert re.search(r"^Take without idle: it tells the change of .* over the next 5 steps", told)
+    assert re.search(r"\nencoder +size +forward +rewarded +reward", told)
+    assert "the features' change over 5 steps" in told
+    blind = {label: known.replace(prediction={}) for label, known in shorter.items()}
+    none = evaluation.replace(encoders=blind, needs={})
+    unsaid = "Which code serves can't be said: episodes are too short to look ahead."
+    assert serving(none) == unsaid
+
+
 def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkeypatch):
     monkeypatch.setattr(regression, "_STEPS", 2)
     result = diagnose({"it": code(held_out.data, "place")}, held_out.data)

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders.base import BaseEncoder
-from jbrep.evaluate.evaluation import Action, Lost, Score, Scores
+from jbrep.evaluate.evaluation import Action, Lost, Score, Scores, nearest_horizon
 from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
 from jbrep.evaluate.prediction import Matters, following
 from jbrep.evaluate.regression import Networks, Predictor, Problem, ridge
@@ -22,7 +22,6 @@ _UNKNOWN = 300  # last steps of an episode cut short, whose return to go isn't k
 _FOLDS = 3  # of the episodes: values in each are judged by what was fitted to the others
 _SHARE = 0.1  # of the usual steps of training
 _ROWS = 50_000  # at most, to fit on and to judge on
-_HORIZON = 10  # steps ahead
 _NEEDED = 0.1  # need from which a feature is needed
 _KEPT = 0.5  # R^2 from which it is kept
 _PREDICTABLE = 0.1  # R^2 below which nothing can be learnt about what a prediction needs
@@ -172,8 +171,8 @@ class Needs(NamedTuple):
     """How much each feature is needed, from 0 to 1.
 
     Attributes:
-        reward: for the mean reward of the next 10 steps, (d,); None where episodes are too short,
-            or it can't be predicted.
+        reward: for the mean reward of the next 10 steps, of shorter episodes of fewer, (d,); None
+            where they are too short for any, or it can't be predicted.
         controller: for that, directly or not, or for what a policy does, by the feature's name;
             empty where episodes are too short.
     """
@@ -199,9 +198,9 @@ def needs(
         policy: that does the task well, if one is known.
         learnt: from the observation.
     """
-    if not learnt.forward:
+    ahead = nearest_horizon(learnt.forward)
+    if ahead is None:
         return Needs(None, {})
-    ahead = min(learnt.forward, key=lambda steps: abs(steps - _HORIZON))
     count = max(2, _NUMBERS // held_out.data.task.size)  # rows in which features are shuffled
     steps = held_out.once(following, "test", ahead)
     some, told = sample(np.arange(len(steps.rows)), count), learnt.forward[ahead]

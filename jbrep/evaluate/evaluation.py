@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Iterable
 from typing import Any, ClassVar, Literal, NamedTuple
 
 from msgspec import UNSET, UnsetType
@@ -13,6 +14,12 @@ from jbrep.stats.bootstrap import Interval
 EVALUATION = "evaluation.json"
 KEPT = "kept_features"  # in what a method says: how many pass around its layers
 _DIGITS = 6
+_USUAL = 10  # steps ahead
+
+
+def nearest_horizon(horizons: Iterable[int]) -> int | None:
+    """Of numbers of steps ahead the one that counts first: the nearest to 10; None of none."""
+    return min(horizons, key=lambda steps: abs(steps - _USUAL), default=None)
 
 
 class Score(NamedTuple):
@@ -159,6 +166,15 @@ class Diagnostics(Record, frozen=True, kw_only=True):
     loses: tuple[Lost, ...]  # the most needed first
     method: dict[str, Any]  # what the method says of its own fit, with KEPT
     sha256: str | None = None  # of the encoder; None of the full observation
+
+    @property
+    def horizon(self) -> int | None:
+        """The steps ahead that count first; None where episodes are too short to look ahead."""
+        return nearest_horizon(map(int, self.prediction))
+
+    def ahead(self, what: str) -> Score | None:
+        """A score of the prediction at that horizon, if it is known."""
+        return getattr(self.prediction[str(self.horizon)], what) if self.prediction else None
 
 
 class Worth(Record, frozen=True, kw_only=True):

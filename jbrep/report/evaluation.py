@@ -1,13 +1,13 @@
 """An evaluation of encoders as tables to read on a screen."""
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 from jbrep.encoders import FULL
 from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Score, Scores, Worth
-from jbrep.evaluate.table import SCALARS, headline
+from jbrep.evaluate.table import SCALARS
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.report.serving import lacking, serving, unreadable, untold
+from jbrep.report.serving import falling_short, lacking, serving, unreadable, untold
 from jbrep.report.worth import advice, conditioning, ranked
 from jbrep.report.worth import title as worth_title
 from jbrep.text import SIGNIFICANT, Table, counted, facts, html, interval, number, r2_text, wrapped
@@ -25,15 +25,17 @@ _WORDS = {
     "angular_velocity_z": "rate of yaw",
 }
 
-_COLUMNS = {  # of the headline
-    "forward": "the features' change over 10 steps, from code and actions",
-    "rewarded": "of that, what the reward depends on",
-    "reward": "the mean reward of these steps",
-    "value": "the discounted return to go",
-    "action": "the action",
+_COLUMNS: dict[str, tuple[str, Callable[[Diagnostics], Score | None]]] = {  # of the headline
+    "forward": ("the features' change over {}, from code and actions", lambda e: e.ahead("mean")),
+    "rewarded": ("of that, what the reward depends on", lambda e: e.ahead("rewarded")),
+    "reward": ("the mean reward of these steps", lambda e: e.ahead("reward")),
+    "value": ("the discounted return to go", SCALARS["value"].read),
+    "action": ("the action", SCALARS["action"].read),
 }
 _OF_POLICY = ("value", "action")
 _LACKING = "What each lacks of what a controller needs (R² of reading it below .5)"
+_NOTHING_NOW = "nothing: it can all be read now, but what becomes of it less well"
+_UNKNOWN = Score(None, None, None)
 _NOISE = 0.1  # the level of corruption that is shown
 _MANY = 8  # quantities from which probes are summed up
 
@@ -72,8 +74,11 @@ def _parts(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
 def _headline(evaluation: Evaluation) -> Table:
     """What tells codes that serve from others: columns of which anything is known."""
     data = evaluation.data
-    numbers = {label: headline(known) for label, known in evaluation.encoders.items()}
-    shown = [c for c in _COLUMNS if any(each[c] is not None for each in numbers.values())]
+    scores = {
+        label: {name: read(known) or _UNKNOWN for name, (_, read) in _COLUMNS.items()}
+        for label, known in evaluation.encoders.items()
+    }
+    shown = [name for name in _COLUMNS if any(e[name].value is not None for e in scores.values())]
     return Table(
         f"R² on {counted(data.test_episodes, 'held-out episode')} ({data.test_rows:,} steps), "
         "nonlinear (1: all, 0: nothing)",
@@ -82,16 +87,16 @@ def _headline(evaluation: Evaluation) -> Table:
             (
                 label,
                 str(evaluation.encoders[label].latent),
-                *(_told(evaluation.encoders[label], name) for name in shown),
+                *(_told(each[name], name) for name in shown),
             )
-            for label in numbers
+            for label, each in scores.items()
         ],
     )
 
 
-def _told(known: Diagnostics, name: str) -> str:
+def _told(score: Score, name: str) -> str:
     """An R² of the headline; that by which codes are chosen with its interval."""
-    value, low, high = SCALARS[name].read(known) or Score(None, None, None)
+    value, low, high = score
     is_chosen_by = name == "rewarded" and low is not None
     return r2_text(value) + (f" [{r2_text(low)}, {r2_text(high)}]" if is_chosen_by else "")
 
@@ -117,9 +122,10 @@ def _unseen(evaluation: Evaluation) -> Iterator[Table]:
 
 def _columns(evaluation: Evaluation, width: int | None) -> str:
     """What the columns of the headline are."""
+    steps = counted(evaluation.encoders[FULL].horizon or 0, "step")
     named = {
-        name: words + (f" of {evaluation.policy}" if name in _OF_POLICY else "")
-        for name, words in _COLUMNS.items()
+        name: words.format(steps) + (f" of {evaluation.policy}" if name in _OF_POLICY else "")
+        for name, (words, _) in _COLUMNS.items()
         if evaluation.policy or name not in _OF_POLICY
     }
     return facts(named, width or sys.maxsize, indent=0)
@@ -147,7 +153,11 @@ def _lacking(evaluation: Evaluation, width: int | None) -> str:
     unsaid = _unsaid(evaluation, width)
     if untold(evaluation):
         return "\n".join(unsaid)
-    lines = {label: lacks or "nothing" for label, lacks in _lacks(evaluation).items()}
+    short = falling_short(evaluation)
+    lines = {
+        label: lacks or (_NOTHING_NOW if label in short else "nothing")
+        for label, lacks in _lacks(evaluation).items()
+    }
     told = facts(lines, width or sys.maxsize, indent=0)
     return "\n".join((wrapped(_LACKING, width), told, *unsaid))
 

@@ -5,14 +5,13 @@ from typing import NamedTuple
 
 from jbrep.encoders import FULL
 from jbrep.evaluate.evaluation import Evaluation, Lost
-from jbrep.evaluate.table import headline
 from jbrep.report.words import enumerated
-from jbrep.text import r2_text
+from jbrep.text import counted, r2_text
 
 _MEASURES = {  # the first that the full observation tells anything of counts
     "rewarded": "the change of what the reward depends on",
     "reward": "the reward",
-    "forward": "what the features change by",
+    "mean": "what the features change by",
 }
 _TOLD = 0.1  # R² of it from the full observation, at least
 _AS_GOOD = 0.9  # the share of that from which a code serves as well
@@ -21,7 +20,7 @@ _AS_GOOD = 0.9  # the share of that from which a code serves as well
 class _Measured(NamedTuple):
     """How well each code, and the full observation, tell what comes next."""
 
-    what: str
+    what: str  # over the next so many steps
     r2: Mapping[str, float]  # of codes, the best first
     full: float
 
@@ -38,12 +37,21 @@ def good_codes(evaluation: Evaluation) -> list[str]:
     return measured.good if measured else []
 
 
+def falling_short(evaluation: Evaluation) -> list[str]:
+    """The codes that are known to tell less than a controller's should."""
+    measured = _measured(evaluation)
+    return [label for label in measured.r2 if label not in measured.good] if measured else []
+
+
 def serving(evaluation: Evaluation) -> str:
     """Which codes serve, or which comes nearest, or why that can't be said."""
     measured = _measured(evaluation)
     if measured is None:
+        unsaid = "Which code serves can't be said"
+        if evaluation.encoders[FULL].horizon is None:
+            return f"{unsaid}: {untold(evaluation)}."
         return (
-            f"Which code serves can't be said: in these {evaluation.data.test_rows:,} held-out "
+            f"{unsaid}: in these {evaluation.data.test_rows:,} held-out "
             "steps even the full observation tells next to nothing of what comes next. Judge them "
             "on more data."
         )
@@ -51,12 +59,19 @@ def serving(evaluation: Evaluation) -> str:
         return f"The full observation alone: R² {r2_text(measured.full)} of {measured.what}."
     take = recommended(evaluation)
     if take is None:
-        nearest, r2 = next(iter(measured.r2.items()))
-        return (
-            f"No code should serve as the full observation does. {nearest} comes nearest: it tells "
-            f"{_told(measured, r2)}."
-        )
+        return f"No code should serve as the full observation does{_nearest(evaluation, measured)}"
     return f"Take {take}: it tells {_told(measured, measured.r2[take])}{_beside(evaluation, take)}"
+
+
+def _nearest(evaluation: Evaluation, measured: _Measured) -> str:
+    """The end of the sentence where no code serves: which comes nearest, if one does."""
+    telling = {label: r2 for label, r2 in measured.r2.items() if r2 >= _TOLD}
+    if not telling:
+        most = max(0.0, *measured.r2.values())
+        return f": none tells {_told(measured, most, 'more than an R²')}."
+    lacks = lacking(evaluation)
+    nearest = min(telling, key=lambda label: bool(lacks[label]))  # else the best of them
+    return f". {nearest} comes nearest: it tells {_told(measured, telling[nearest])}."
 
 
 def recommended(evaluation: Evaluation) -> str | None:
@@ -85,23 +100,24 @@ def _beside(evaluation: Evaluation, take: str) -> str:
     return end
 
 
-def _told(measured: _Measured, r2: float) -> str:
+def _told(measured: _Measured, r2: float, how_well: str = "an R²") -> str:
     """What is told, and how well, beside the full observation."""
     return (
-        f"{measured.what} over the next 10 steps with an R² of {r2_text(r2)} (the full one: "
-        f"{r2_text(measured.full)})"
+        f"{measured.what} with {how_well} of {r2_text(r2)} (the full one: {r2_text(measured.full)})"
     )
 
 
 def _measured(evaluation: Evaluation) -> _Measured | None:
     """By the first measure that the full observation tells anything of; None if there is none."""
-    numbers = {label: headline(known) for label, known in evaluation.encoders.items()}
+    steps = evaluation.encoders[FULL].horizon
     for name, what in _MEASURES.items():
-        full = numbers[FULL][name]
-        if full is not None and full >= _TOLD:
-            known = {label: each[name] or 0.0 for label, each in numbers.items() if label != FULL}
-            ranked = sorted(known, key=lambda label: -known[label])
-            return _Measured(what, {label: known[label] for label in ranked}, full)
+        scores = {label: known.ahead(name) for label, known in evaluation.encoders.items()}
+        known = {label: (score and score.value) or 0.0 for label, score in scores.items()}
+        if (full := known.pop(FULL)) >= _TOLD:
+            ranked = sorted(known.items(), key=lambda item: -item[1])
+            return _Measured(
+                f"{what} over the next {counted(steps or 0, 'step')}", dict(ranked), full
+            )
     return None
 
 

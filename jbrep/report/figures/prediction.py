@@ -17,7 +17,6 @@ from jbrep.stats.bootstrap import Array
 from jbrep.text import r2_text
 
 MOST = 40  # features in a picture, and names on an axis
-_HORIZON = 10  # steps that the heat map looks ahead, if the evaluation has them
 _SUMS = {"mean": "mean of features", "reward": "reward"}  # of a prediction, in words
 _COLUMNS = ("encoder", "steps", "target", "r2", "low", "high")
 _CHARACTER = 0.06  # of a title [inches]
@@ -63,7 +62,7 @@ def prediction_plots(task: str, encoders: Encoders) -> list[Plot]:
 
 def _by_feature(task: str, encoders: Encoders) -> Plot:
     """R² of each feature's change and of the reward (rows) for each encoder (columns)."""
-    steps = _shown_horizon(encoders)
+    steps = str(next(iter(encoders.values())).horizon)
     count = len(_features(encoders, steps))
     part = f" Of {count} features the {MOST} that lose most are shown; all are in the table."
     return Plot(
@@ -77,11 +76,6 @@ def _by_feature(task: str, encoders: Encoders) -> Plot:
         list(_rows(encoders)),
         lambda: _draw_features(task, encoders, steps),
     )
-
-
-def _shown_horizon(encoders: Encoders) -> str:
-    horizons = next(iter(encoders.values())).prediction
-    return min(horizons, key=lambda steps: abs(int(steps) - _HORIZON))
 
 
 def _features(encoders: Encoders, steps: str) -> list[str]:
