@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from judged import NOTHING, diagnostics, evaluation
+from judged import NOTHING, diagnostics, evaluation, prediction
 from made_up import drawn, label_of, returns_of
 from matplotlib.text import Text
 from PIL import Image
@@ -359,6 +359,8 @@ def test_diagrams_show_what_any_method_does():
     assert ("observation", "16 features, angles, standard scaling") in of_system
     assert ("latent", "9 numbers") in of_system  # eight and the one that passes around
     assert of_layers[0] == ("slow", "encoder", 0, 8, "linear")
+    one = label_of(describe("face_direction"), "pca-1", [(1, "linear")], [(16, "linear")], "pca")
+    assert ("latent", "1 number") in study_plots(None, [], {}, {"x": one})[0].rows
     (axes,) = drawn(diagrams[1]).axes
     assert axes.get_title(loc="center") == "slow\nangle_to_target passed around"
 
@@ -399,6 +401,8 @@ def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
     assert row[2:5] == error
     axes = drawn(found["error_by_latent"]).axes[0]
     assert any(error.value in container.lines[0].get_ydata() for container in axes.containers)
+    assert axes.lines[-1].get_label() == "PCA"
+    assert axes.lines[-1].get_marker() == "o"  # as a line, one size alone couldn't be seen
     matrix = drawn(found["latent_correlation"]).axes[0].images[0].get_array()
     expected = encoders["dae-12"].latent_units.correlation
     np.testing.assert_array_equal(matrix, np.array(expected, float))
@@ -539,7 +543,7 @@ def of_methods():
     spectra = {"10": spectrum, "2": [0.99, 0.95, 0.4, 0.2]}
     slow = {"spectrum": spectrum, "spectra": spectra}
     losses = {"train_loss": 0.2, "test_loss": 0.3}
-    parts = {"1": {"changes": 0.4, "reward": 0.1}, "20": {"changes": 0.9, "reward": 0.8}}
+    parts = {"1": {"changes": 0.4, "reward": 0.1}, "20": {"changes": 0.9, "reward": 1.8}}
     methods = {
         "full": ("full", 4, 0.9, {}),
         "slow-2": ("slow", 2, 0.8, slow),
@@ -575,6 +579,13 @@ def test_predictions_stand_by_feature_and_encoder(of_methods):
     assert low < 0.1 < 0.9 < high  # no encoder is cut off
 
 
+def test_an_interval_far_below_nothing_leaves_predictions_readable():
+    wild = prediction(0.2, reward=Score(0.1, -138.0, 0.3))
+    plots = encoder_plots(evaluation({"full": diagnostics(prediction={"1": wild})}))
+    axes = drawn({plot.name: plot for plot in plots}["prediction_by_horizon"]).axes[0]
+    assert axes.get_ylim() == (-0.1, 1.03)
+
+
 def test_a_spectrum_shows_which_units_a_code_keeps(of_methods):
     axes = drawn(of_methods["spectrum"]).axes[0]
     line, *rings = axes.lines  # one line of both, as their spectra are the same
@@ -604,9 +615,11 @@ def test_timescales_are_those_of_an_exponential_decay(of_methods):
 def test_losses_of_training_stand_by_horizon_and_part(of_methods):
     changes, reward = drawn(of_methods["loss_by_horizon"]).axes
     assert list(changes.lines[1].get_ydata()) == [0.4, 0.9]
-    assert list(reward.lines[1].get_ydata()) == [0.1, 0.8]
+    assert list(reward.lines[1].get_ydata()) == [0.1, 1.8]
+    assert reward.get_ylim()[1] > 1.8  # on the axis that both share
     assert of_methods["losses"].rows == [("forward-2-s1", 0.2, 0.3)]
-    drawn(of_methods["losses"])
+    (axes,) = drawn(of_methods["losses"]).axes
+    assert axes.get_xscale() == "linear"  # a logarithmic one would have labels on each other
 
 
 def test_losses_stand_by_term_and_divergences_by_unit():

@@ -17,6 +17,7 @@ from jbrep.envs.task import Task
 from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.style import PAGE, Looks, ink, panel_grid, plain
 from jbrep.study.record import EncoderFacts, Label, ShownFacts
+from jbrep.text import counted
 
 _MOST = 20  # units of a layer that are drawn
 _TITLE = 45  # characters on a line above a panel
@@ -115,7 +116,7 @@ def system(shared: Label, looks: Looks) -> Plot:
         ("robot", settings.task + (f"\nsteps{step}" if step else "")),
         ("observation", f"{encoder.size} features\n{_scaled(encoder.shown)}"),
         ("encoder", f"{settings.representation}\n{encoder.size} to {latent}"),
-        ("latent", f"{latent} numbers"),
+        ("latent", counted(latent, "number")),
         ("agent", f"{settings.algorithm.upper()}\nhidden {hidden}"),
     ]
     return Plot(
@@ -135,8 +136,7 @@ def _scaled(facts: ShownFacts) -> str:
 
 def _action(task: Task) -> str:
     """Such as 6 numbers in [-1, 1]; without bounds where they differ."""
-    count = len(task.action_low)
-    numbers = "1 number" if count == 1 else f"{count} numbers"
+    numbers = counted(len(task.action_low), "number")
     bounds = set(zip(task.action_low, task.action_high, strict=True))
     return f"{numbers} in [{{:g}}, {{:g}}]".format(*bounds.pop()) if len(bounds) == 1 else numbers
 

@@ -132,7 +132,8 @@ def _draw_sizes(task: str, encoders: _Encoders) -> Figure:
         errors = [e.error.mse for e in of_size.values()]
         draw_line(axes, [*of_size], errors, label=plain(name), **style)
     pca = {e.latent: e.error.pca_mse.value for e in encoders.values()}
-    axes.plot(sizes, np.array([pca[size] for size in sizes], float), label="PCA", **reference())
+    lost = np.array([pca[size] for size in sizes], float)
+    axes.plot(sizes, lost, marker="o", ms=2.5, label="PCA", **reference())
     axes.set(xlabel="latent size l", ylabel="mean squared error", yscale="log", xticks=sizes)
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_title(f"{task}: error on held-out episodes")

@@ -27,6 +27,7 @@ from jbrep.report.figures.style import (
 from jbrep.stats.bootstrap import Array
 
 _ABOVE = 0.4  # panels, for a title [inches]
+_WIDE = 10  # times the least loss, beyond which an axis is logarithmic
 _LOSSES = ("train_loss", "test_loss")
 _WORDS = {"lipschitz": "Lipschitz"}  # of terms
 
@@ -194,8 +195,8 @@ def _draw_loss_by_horizon(task: str, encoders: Encoders) -> Figure:
         for label, e in encoders.items():
             losses = _losses_of(e, part)
             axes.plot(list(losses), list(losses.values()), ms=3, label=plain(label), **look[label])
-        axes.set(title=part, xlabel="steps ahead", ylim=(0, None))
-    panels[0].set_ylabel("loss on held-out windows")
+        axes.set(title=part, xlabel="steps ahead")
+    panels[0].set(ylabel="loss on held-out windows", ylim=(0, None))
     below(figure, panels)
     figure.suptitle(plain(f"{task}: loss of forward models by steps ahead"), size=8)
     return figure
@@ -293,7 +294,11 @@ def _draw_losses(task: str, encoders: Encoders) -> Figure:
         axes.plot((train, test), (row, row), color=colour, lw=0.9)
         axes.plot(train, row, "o", ms=4.5, mfc="none", mec=colour)
         axes.plot(test, row, "o", ms=3, color=colour)
-    axes.set(xscale="log" if (values > 0).all() else "linear", xlabel="loss")
+    if values.min() > 0 and values.max() > _WIDE * values.min():
+        axes.set_xscale("log")
+    else:
+        axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.set_xlabel("loss")
     axes.set_yticks(range(len(encoders)), [plain(label) for label in encoders])
     axes.set_ylim(len(encoders) - 0.4, -0.6)
     axes.set_title(plain(f"{task}:\ntraining loss (open), held-out loss (filled)"))

@@ -20,7 +20,7 @@ MOST = 40  # features in a picture, and names on an axis
 _SUMS = {"mean": "mean of features", "reward": "reward"}  # of a prediction, in words
 _COLUMNS = ("encoder", "steps", "target", "r2", "low", "high")
 _CHARACTER = 0.06  # of a title [inches]
-_LOWEST = -0.1  # R² on an axis
+_LOWEST, _HIGHEST = -0.1, 1.03  # R² on an axis
 
 
 def heat_map(values: Array, rows: Sequence[str], columns: Sequence[str], title: str) -> Figure:
@@ -38,7 +38,7 @@ def heat_map(values: Array, rows: Sequence[str], columns: Sequence[str], title: 
     bare(axes)
     lines = (fill(plain(line), int(width / _CHARACTER)) for line in title.splitlines())
     figure.suptitle("\n".join(lines), x=0.01, ha="left", size=7.5)
-    figure.colorbar(picture, label="R² on held-out episodes")
+    figure.colorbar(picture, label="R²")
     return figure
 
 
@@ -120,7 +120,7 @@ def _by_horizon(task: str, encoders: Encoders) -> Plot:
         f"{task}: prediction by steps ahead",
         "R² of the changes over so many steps, averaged over features, and of the mean reward over "
         "them, predicted from the code and the actions taken meanwhile, on held-out episodes; "
-        "bars: 95 % intervals over episodes.",
+        f"bars: 95 % intervals over episodes. What is below {_LOWEST} isn't shown.",
         _COLUMNS,
         [row for row in _rows(encoders) if row[2] in _SUMS.values()],
         lambda: _draw_horizons(task, encoders),
@@ -136,9 +136,9 @@ def _draw_horizons(task: str, encoders: Encoders) -> Figure:
             scores = [getattr(each, key) for each in e.prediction.values()]
             draw_line(axes, [*e.prediction], scores, label=plain(label), **look[label])
         axes.set(xlabel="steps ahead", title=words)
-    panels[0].set(
-        ylabel="R² on held-out episodes", ylim=(max(panels[0].get_ylim()[0], _LOWEST), None)
-    )
+    low, high = panels[0].get_ylim()
+    high = np.clip(high, -_LOWEST, _HIGHEST)  # one far below widens the margin above, too
+    panels[0].set(ylabel="R² on held-out episodes", ylim=(max(low, _LOWEST), high))
     below(figure, panels)
     figure.suptitle(plain(f"{task}: prediction by steps ahead"), size=8)
     return figure
