@@ -381,9 +381,16 @@ def test_an_encoder_has_the_same_bytes_whatever_the_number_of_threads(kind, data
     assert made[0].read_bytes() == made[1].read_bytes()
 
 
-def test_a_lag_that_leaves_too_few_pairs_is_refused(data, tmp_path):
-    with pytest.raises(InputError, match="has 4 pairs of rows 999 steps apart to learn from"):
-        Fitter(data, tmp_path).fit("slow", latent=4, lags=(999,))
+@pytest.mark.parametrize(
+    ("kind", "far", "advice"),
+    [("slow", "lags", "a smaller lag"), ("linear-forward", "horizons", "smaller horizons")],
+)
+def test_rows_so_far_apart_that_too_few_pairs_are_left_are_refused(
+    kind, far, advice, data, tmp_path
+):
+    said = f"has 4 pairs of rows 999 steps apart to learn from, which .*: give {advice}, or more"
+    with pytest.raises(InputError, match=said):
+        Fitter(data, tmp_path).fit(kind, latent=4, **{far: (999,)})
 
 
 def test_keeping_everything_leaves_nothing_to_reduce(data, tmp_path):

@@ -8,9 +8,8 @@ from msgspec import Meta
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.errors import InputError
 from jbrep.methods.linear import Directions, direction_code, whitening
-from jbrep.methods.passes import Array, Block, blocks
+from jbrep.methods.passes import Array, Block, blocks, check_enough
 from jbrep.training.method import Made
 from jbrep.training.settings import Steps
 
@@ -39,7 +38,7 @@ class Lagged:
         across: E[x y'], (lags, n, size).
 
     Raises:
-        InputError: no episode is longer than the longest lag.
+        InputError: no episode is longer than the longest lag, or there are too few.
     """
 
     def __init__(
@@ -67,11 +66,7 @@ class Lagged:
                 self.later_mean[i] += after.sum(axis=0)
                 self.across[i] += first.T @ after
                 self.later[i] += after.T @ after
-        if windows <= width:
-            raise InputError(
-                f"{data.dataset.folder} has {windows} pairs of rows {longest} steps apart to learn "
-                f"from, which must be more than {width}: give a smaller lag, or more data"
-            )
+        check_enough(windows, width, data, longest, "a smaller lag")
         for total in (self.now_mean, self.now, self.later_mean, self.later, self.across):
             total /= windows
 

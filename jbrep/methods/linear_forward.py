@@ -12,7 +12,7 @@ from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.errors import InputError
 from jbrep.methods.linear import Directions, direction_code, whitening
-from jbrep.methods.passes import Array, blocks
+from jbrep.methods.passes import Array, blocks, check_enough
 from jbrep.training.method import Made
 from jbrep.training.settings import RewardWeight, Steps, Weight
 
@@ -102,6 +102,9 @@ def _moments(data: ScaledDataset, horizons: tuple[int, ...]) -> tuple[Moments, A
     """Moments of rows with actions (p,), their covariances with targets, (p, t), and variances.
 
     The variances are those of the targets, (t,).
+
+    Raises:
+        InputError: there are no more windows than regressors, which could tell anything of them.
     """
     size, longest, turn = data.size, max(horizons), turns(data)
     actions = longest * data.task.action_size
@@ -120,6 +123,7 @@ def _moments(data: ScaledDataset, horizons: tuple[int, ...]) -> tuple[Moments, A
         total += values.sum(axis=0)
         products += values[:, :regressors].T @ values
         squares += np.einsum("mt,mt->t", values[:, regressors:], values[:, regressors:])
+    check_enough(count, regressors, data, longest, "smaller horizons")
     mean = total / count
     covariance = products / count - np.outer(mean[:regressors], mean)
     moments = Moments(mean[:regressors], covariance[:, :regressors])

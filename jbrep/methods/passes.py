@@ -94,3 +94,23 @@ def blocks(data: ScaledDataset, horizon: int, width: int, work: int) -> Iterator
         last = min(first + size, int(reach))
         yield Block(data, starts[first:last], horizon)
         first += (last - first) * every
+
+
+def check_enough(count: int, width: int, data: ScaledDataset, apart: int, less: str) -> None:
+    """Make sure that there are more windows than numbers in each to regress on.
+
+    Args:
+        count: of windows.
+        width: numbers in each.
+        data: that they are of.
+        apart: steps from the first to the last row of a window.
+        less: what to give to have more windows, or fewer numbers.
+
+    Raises:
+        InputError: there aren't.
+    """
+    if count <= width:
+        raise InputError(
+            f"{data.dataset.folder} has {count} pairs of rows {apart} steps apart to learn from, "
+            f"which must be more than {width}: give {less}, or more data"
+        )
