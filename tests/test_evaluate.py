@@ -449,6 +449,15 @@ def test_correlation_takes_units_alone_as_candidates(held_out, coder, everything
     assert shown["uprightness"][0] < 0.99  # though other dimensions of the state are related
 
 
+def test_a_dimension_that_does_not_vary_has_no_correlation():
+    held_out = HeldOut(wide([50] * 10, features=4))  # the first feature is constant
+    gtc = correlation(make(held_out.data, ((), ())), held_out)
+    assert gtc.dimensions["obs_0"] == (None,) * 3
+    assert gtc.mean == pytest.approx((1, 1, 1))
+    held_out.data.dataset.arrays["observation"][:] = 1
+    assert correlation(make(held_out.data, ((), ())), held_out).mean == (None,) * 3
+
+
 def still(units, weight=0.0):
     """Layers whose latent hardly depends on what is observed."""
     bias = np.linspace(-0.3, 0.3, units, dtype=np.float32)

@@ -269,7 +269,8 @@ def correlation(encoder: BaseEncoder, held_out: HeldOut) -> Correlation:
     """How directly single units show the state: the ground-truth correlation (GTC).
 
     For each dimension of the state, the largest absolute correlation with a unit of the latent; as
-    in the S-RL Toolbox, but other dimensions of the state are not counted as units.
+    in the S-RL Toolbox, but other dimensions of the state are not counted as units. None of one
+    that doesn't vary; the mean is over the others.
 
     Its cost grows as latent units times dimensions of the state, so of a robot with more than 128
     features, or a latent with more units, only some dimensions are looked at: 48 of 348. They are
@@ -292,7 +293,9 @@ def correlation(encoder: BaseEncoder, held_out: HeldOut) -> Correlation:
         shared = zs - z[..., :, None] * s[..., None, :] / n[..., None]
         spread = np.sqrt(spread_z[..., :, None] * spread_s[..., None, :])
         by_name = np.where(spread > 0, np.abs(shared) / spread, 0).max(axis=-2)
-        return np.append(by_name, by_name.mean(axis=-1, keepdims=True), axis=-1)
+        varies = spread_s > 0
+        mean = by_name.sum(axis=-1, keepdims=True) / varies.sum(axis=-1, keepdims=True)
+        return np.append(np.where(varies, by_name, np.nan), mean, axis=-1)
 
     *by_name, mean = scores(bootstrap(largest, *sums, products))
     return Correlation(
