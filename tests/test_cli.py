@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.shell_completion import ShellComplete
 from command import jbrep, mistake
@@ -24,6 +25,7 @@ from jbrep.envs import describe
 from jbrep.evaluate.table import SCALARS, Diagnosed, write_diagnostics
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.registry import METHODS
+from jbrep.rl.files import read_evaluations
 
 GROUPS = ("data", "encoder", "policy")
 COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
@@ -34,14 +36,18 @@ COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
 def test_a_run_from_training_to_its_returns(tmp_path):
     run = tmp_path / "runs" / "dae-8"
     settings = ("--task", "face_direction", "--algorithm", "a2c", "--preset", "paper")
-    settings += ("--steps", 40, "--episode-steps", 100)
+    settings += ("--steps", 40, "--episode-steps", 100, "--final-episodes", 12)
     for _ in range(2):  # the second time it is over
         given = (*settings, "--encoder", "dae-8", "--evaluation-episodes", 1, "--out", run)
         said = jbrep("rl", *given).output
         assert "returns on dae-8 at the end: " in said
         beside = r"standing still [\d.]+, constant drive [\d.]+, random [\d.]+; hand-written [\d.]+"
         told = " ".join(said.split())
-        assert re.search(rf"learned \(policies that don't look: {beside}; in 10 episodes\)", told)
+        same = rf"\(in the same, policies that don't look: {beside}\)"
+        found = re.search(rf"learned: on average ([\d.]+) in 10 episodes {same}", told)
+        final = [each.episode_return for each in read_evaluations(run) if each.step >= 40]
+        assert len(final) == 12
+        assert float(found[1]) == pytest.approx(np.mean(final[:10]), rel=0.01)
     assert A2C.load(run / "policy.zip", device="cpu").observation_space.shape == (8,)
     told = jbrep("evaluate-policy", run, "--episodes", 2).output
     assert re.fullmatch(

@@ -16,34 +16,40 @@ _WORDS = {YES: "learned", UNCLEAR: "not clearly learned", NO: "not learned"}
 
 
 class Beside(NamedTuple):
-    """What a run's agent returns, beside policies that don't learn.
+    """What a run's agent returns, beside policies that don't learn, in the same episodes.
 
     Attributes:
         learnt: yes, no or unclear: whether it ends above the best policy that doesn't look.
+        mean: return of the agent.
         references: mean returns by policy.
-        episodes: of each policy.
+        episodes: how many these are.
     """
 
     learnt: str
+    mean: float
     references: dict[str, float]
     episodes: int
 
     def __str__(self) -> str:
-        shown = dict(zip(self.references, rounded(*self.references.values()), strict=True))
+        agent, *others = rounded(self.mean, *self.references.values())
+        shown = dict(zip(self.references, others, strict=True))
         written = shown.pop(LOOKING, None)
         told = ", ".join(f"{name} {value}" for name, value in shown.items())
         told += f"; {LOOKING} {written}" if written else ""
         played = counted(self.episodes, "episode")
-        return f"{_WORDS[self.learnt]} (policies that don't look: {told}; in {played})"
+        return (
+            f"{_WORDS[self.learnt]}: on average {agent} in {played} (in the same, policies that "
+            f"don't look: {told})"
+        )
 
 
 def beside(task: Task, returns: Sequence[float] | Array, episodes: int) -> Beside | None:
-    """Compare the returns of a run's final evaluation with those of policies that don't learn.
+    """Compare a run's final returns with those of policies that don't learn, in some episodes.
 
     Args:
         task: of the run.
         returns: of the final evaluation's episodes.
-        episodes: how many the other policies play, from the same starts as the first of these.
+        episodes: how many of these, the first, count; the other policies play from their starts.
 
     Returns:
         None where the other policies can't be played.
@@ -55,4 +61,5 @@ def beside(task: Task, returns: Sequence[float] | Array, episodes: int) -> Besid
         return None
     bounds = Bounds.of(task.return_floor, task.return_ceiling)
     blind = mean_within(played[best], bounds, LEVEL)
-    return Beside(learnt(np.asarray(returns), blind, bounds), means, episodes)
+    own = np.asarray(returns[:episodes])
+    return Beside(learnt(own, blind, bounds), float(own.mean()), means, episodes)
