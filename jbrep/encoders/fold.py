@@ -245,13 +245,14 @@ def _recognised(results: Array, chain: Chain) -> Chain | None:
     """
     if results.dtype != _PROBES.dtype or not np.isfinite(results).all():
         return None
+    absolute = _PRECISION * min(1.0, np.abs(results).max())  # a function may be small everywhere
     for name, function in ACTIVATIONS.items():
         if name in WHOLE:
             continue
         values = function(_PROBES)
         factor = _plain((results[-1] - results[0]) / (values[-1] - values[0]))
         shift = _plain(results[0] - factor * values[0])
-        if factor and np.allclose(factor * values + shift, results, _PRECISION, _PRECISION):
+        if factor and np.allclose(factor * values + shift, results, _PRECISION, absolute):
             active = chain if name == "linear" else chain.activate(name)
             return active if (factor, shift) == (1, 0) else active.scale(factor, shift)
     return None

@@ -16,12 +16,13 @@ from onnx import TensorProto, helper, numpy_helper
 
 from jbrep.encoders import fold
 from jbrep.encoders.encoder import Encoder, imported
-from jbrep.encoders.fold import Action, Value, refusal
+from jbrep.encoders.fold import Action, Chain, Value, refusal
 from jbrep.encoders.layers import EPSILON, Layer
 from jbrep.encoders.operations import NOTHING, VALUE, check_first_alone, operation, with_slope
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line
 from jbrep.records.storage import exists, read_file
+from jbrep.text import counted
 
 LATENT, RECONSTRUCTION = "latent", "reconstruction"  # the outputs of a model that jbrep exported
 Constants = dict[str, NDArray[np.generic]]
@@ -64,7 +65,7 @@ def _layers(path: Path, size: int) -> tuple[tuple[Layer, ...], tuple[Layer, ...]
     """The layers of a model, and those from its latent to its reconstruction, if it has both."""
     model, constants = _read(path)
     try:
-        start = _input(model.graph, constants, size)
+        start, rows = _input(model.graph, constants, size)
         outputs = [output.name for output in model.graph.output]
         if len(outputs) != 1 and sorted(outputs) != [LATENT, RECONSTRUCTION]:
             raise InputError(
@@ -74,10 +75,10 @@ def _layers(path: Path, size: int) -> tuple[tuple[Layer, ...], tuple[Layer, ...]
         uses = Counter(name for node in model.graph.node for name in node.input)
         nodes, values = iter(model.graph.node), _Values({start: fold.given(size)})
         if len(outputs) == 1:
-            return _fold(nodes, values, outputs[0], constants, uses), ()
-        layers = _fold(nodes, values, LATENT, constants, uses)
+            return _fold(nodes, values, outputs[0], constants, uses, rows), ()
+        layers = _fold(nodes, values, LATENT, constants, uses, rows)
         values = {**dict.fromkeys(values), LATENT: fold.given(len(layers[-1].bias))}
-        return layers, _fold(nodes, values, RECONSTRUCTION, constants, uses)
+        return layers, _fold(nodes, values, RECONSTRUCTION, constants, uses, rows)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -160,14 +161,14 @@ def _bytes(path: Path) -> bytes:
     return read_file(path, _MAX_BYTES)
 
 
-def _input(graph: onnx.GraphProto, constants: Constants, size: int) -> str:
-    """The name of a graph's input."""
+def _input(graph: onnx.GraphProto, constants: Constants, size: int) -> tuple[str, int]:
+    """The name of a graph's input, and its number of rows; 0 if it may have any."""
     inputs = [each for each in graph.input if each.name not in constants]
     if len(inputs) != 1:
         names = ", ".join(each.name for each in inputs) or "none"
         raise InputError(f"it has the inputs {names}: expected one")
     (given,) = inputs
-    kind = given.type.tensor_type
+    kind, rows = given.type.tensor_type, 0
     if kind.elem_type not in _FLOATS:
         raise InputError(f"its input {given.name} must be of float32")
     if kind.HasField("shape"):
@@ -175,7 +176,8 @@ def _input(graph: onnx.GraphProto, constants: Constants, size: int) -> str:
         if len(shape) != 2 or (isinstance(shape[1], int) and shape[1] != size):
             shown = ", ".join(map(str, shape))
             raise InputError(f"its input {given.name} is ({shown}), expected (rows, {size})")
-    return given.name
+        rows = kind.shape.dim[0].dim_value
+    return given.name, rows
 
 
 def _fold(
@@ -184,6 +186,7 @@ def _fold(
     end: str,
     constants: Constants,
     uses: Counter[str],
+    rows: int,
 ) -> tuple[Layer, ...]:
     """The layers that lead to a value, by the nodes up to its own; values and constants grow.
 
@@ -196,7 +199,7 @@ def _fold(
             raise InputError(refusal(f"{node.domain}.{said}", "it is no operation of ONNX itself"))
         try:
             _check_size(values, constants)
-            given = _Node(node, values, constants)
+            given = _Node(node, values, constants, rows)
             if given.values:
                 action = given.action()
             else:
@@ -230,10 +233,13 @@ def _check_size(values: _Values, constants: Constants) -> None:
 
 
 class _Node:
-    """A node with its attributes and inputs: VALUE, a constant, or None for one left out."""
+    """A node with its attributes and inputs: VALUE, a constant, or None for one left out.
 
-    def __init__(self, node: onnx.NodeProto, values: _Values, constants: Constants):
-        self.operation = node.op_type
+    All values have as many rows; 0 if these may be any.
+    """
+
+    def __init__(self, node: onnx.NodeProto, values: _Values, constants: Constants, rows: int):
+        self.operation, self.rows = node.op_type, rows
         self.attributes: dict[str, Any] = {
             each.name: helper.get_attribute_value(each) for each in node.attribute
         }
@@ -326,10 +332,22 @@ def _flatten(node: _Node) -> Action:
     return NOTHING
 
 
+def _reshape(node: _Node) -> Action:
+    node.must("allowzero", 0)
+    rows, *units = node.given(1).tolist()
+    if rows not in (0, -1, node.rows):
+        made = counted(rows, "row")
+        raise InputError(f"it makes {made} of any number, expected 0 or -1 for all of them")
+    return operation("reshape", VALUE, rows, *units)
+
+
 def _squeeze(node: _Node) -> Action:
-    if node.given(1) is not None or "axes" in node.attributes:
-        raise InputError("it removes a dimension")
-    return NOTHING
+    def apply(chain: Chain) -> Chain:
+        if 1 in (node.rows, chain.width) or node.given(1) is not None or "axes" in node.attributes:
+            raise InputError("it removes a dimension")
+        return chain
+
+    return Action(apply, None)
 
 
 def _cast(node: _Node) -> Action:
@@ -349,7 +367,7 @@ _SAME = {  # those that PyTorch calls so, too, and that have no attributes
 _ACTIONS: dict[str, Callable[[_Node], Action]] = {  # of one value, the first input
     "Gemm": _gemm,
     "Flatten": _flatten,
-    "Reshape": lambda node: operation("reshape", VALUE, *node.given(1).tolist()),
+    "Reshape": _reshape,
     "Squeeze": _squeeze,
     "Cast": _cast,
     "Dropout": _dropout,

@@ -37,11 +37,26 @@ def operation(name: str, *args: Any, **options: Any) -> Action:
         if make is None:
             raise InputError("an encoder has no such layer")
         check_first_alone(args)
+    else:
+        _check_dimensions(args)
     try:
         inspect.signature(make).bind(*args, **options)
         return make(*args, **options)
     except TypeError:
         raise InputError("not with these arguments") from None
+
+
+def _check_dimensions(args: Any) -> None:
+    """Make sure that no constant makes more dimensions than (rows, units).
+
+    Raises:
+        InputError: one does.
+    """
+    for each in args:
+        if each is not VALUE and np.ndim(each) > 2:
+            raise InputError(
+                f"it has a constant of shape {np.shape(each)}, expected at most two dimensions"
+            )
 
 
 def check_first_alone(args: Any) -> None:
