@@ -853,10 +853,10 @@ def test_the_command_names_the_file_after_its_content(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told = jbrep("inspect", FACE, "--episode", 1, "--encoder", "dae-8").output
     path = "inspect/face_direction-data-sample-episode-1-dae-8.rrd"
-    assert told == f"encoder: dae-8, shipped\n{path}; open it with: rerun {path}\n"
+    assert told == f"encoder: dae-8, shipped\nopen it with:\nrerun {path}\n"
     assert len(read(tmp_path / path)["/observation/position"]["step"]) == ROWS
     told = jbrep("inspect", "--encoder", "dae-4", "--task", "move_to_pose", "--traverse").output
-    assert "inspect/move_to_pose-uniform-episode-0-dae-4-traverse.rrd;" in told
+    assert "inspect/move_to_pose-uniform-episode-0-dae-4-traverse.rrd\n" in told
     refused = jbrep("inspect", FACE, "--view", "--serve")
     assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
     assert "Example: jbrep inspect " in jbrep("inspect", "--help").output

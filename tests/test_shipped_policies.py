@@ -24,6 +24,7 @@ def test_each_file_that_ships_is_listed_with_what_it_returns():
         assert known["episodes"] == len(policy.returns[SHIPPED]) == 100
     lines = jbrep("policies").output.splitlines()
     assert [line.split()[0] for line in lines[1 : len(SHIPS) + 1]] == [*told]
+    assert lines[-1].startswith("falling: the preset wide, but with")  # in a learner's name
 
 
 @pytest.mark.parametrize("policy", SHIPS, ids=lambda policy: policy.task)

@@ -357,7 +357,7 @@ def test_a_command_says_what_is_missing(tmp_path):
     for arguments, message in (
         (("env", "Pendulum-v1", "--env", "g"), "--env g isn't an argument"),
         (("env", "Pendulum-v1", "--env", "g=1", "--env", "g=2"), "a second one: write NAME=VALUE"),
-        (("collect", "--steps", 5, "--out", tmp_path / "x"), "give the --task"),
+        (("collect", "--steps", 5, "--out", tmp_path / "x"), "Missing option '--task'"),
         (("env", "Sledges/Endless-v0"), "has no time limit: give one with --episode-steps"),
     ):
         told = jbrep(*arguments)

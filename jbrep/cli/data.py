@@ -14,6 +14,7 @@ from jbrep.cli.environment import (
     given_task,
     import_option,
     needed_task,
+    needed_task_option,
     retries_option,
     task_option,
     threads_option,
@@ -41,7 +42,7 @@ _data = click.argument("data", type=PATH)
 
 
 @click.command(epilog="Example: jbrep collect --task face_direction --steps 5M --out data/face")
-@task_option
+@needed_task_option
 @record_options(CollectSettings, shard_episodes=None)
 @click.option(
     "--policy",

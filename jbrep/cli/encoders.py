@@ -8,7 +8,13 @@ import click
 
 from jbrep.cli.base import PATH, Variadic, as_json, data_option
 from jbrep.cli.completion import complete_encoder, complete_task
-from jbrep.cli.environment import environment_options, given_task, needed_task, task_option
+from jbrep.cli.environment import (
+    environment_options,
+    given_task,
+    needed_task,
+    needed_task_option,
+    task_option,
+)
 from jbrep.cli.output import echo_json, echo_text, say
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
@@ -278,7 +284,7 @@ def export(encoder: str, out: Path, **options: Any) -> None:
     "--out encoders/mine.safetensors",
 )
 @click.argument("model", type=PATH)
-@task_option
+@needed_task_option
 @click.option(
     "--decoder",
     type=PATH,

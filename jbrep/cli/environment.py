@@ -95,10 +95,15 @@ retries_option = click.option(
     show_default=True,
     help="How often in a row an environment that fails is made anew and tried again.",
 )
-task_option = click.option(  # from which, with `environment_options`, `given_task` makes a task
-    "--task",
-    shell_complete=complete_task,
-    help="One of the Jitterbug's, such as face_direction, or a Gymnasium id: Hopper-v5.",
+# From either, with `environment_options`: `given_task` and `needed_task` make a task.
+task_option, needed_task_option = (
+    click.option(
+        "--task",
+        required=required,
+        shell_complete=complete_task,
+        help="One of the Jitterbug's, such as face_direction, or a Gymnasium id: Hopper-v5.",
+    )
+    for required in (False, True)
 )
 
 

@@ -82,7 +82,11 @@ def inspect(
     from jbrep.inspection import inspect as record  # imports torch
 
     path = record(source, episode, task, encoder, traverse, out, data, say)
-    say(f"{path}" if view or serve else f"{path}; open it with: rerun {quote(str(path))}")
+    if view or serve:
+        say(str(path))
+    else:
+        click.echo("open it with:")
+        say(f"rerun {quote(str(path))}")
     if view:
         _run_viewer(path)
     if serve:

@@ -85,13 +85,13 @@ def evaluate_policy(
     """Show the returns of a policy.
 
     POLICY is a folder of jbrep rl, a zip file that stable-baselines3 wrote, or a policy by its
-    name, such as heuristic, or trained, which ships; a name needs a --task, which is face_direction
-    if not given, and a zip file does unless jbrep wrote it. A run that is under way or was stopped
-    plays its last checkpoint. Of a folder only numbers are read. A zip file from elsewhere runs as
-    code when it is opened, so it needs --trust; its agent sees what the environment gives, unless
-    jbrep wrote it, or --encoder and --vecnormalize say what it was trained on. A policy by name may
-    act on what an encoder's latent is decoded to: the return that it loses measures what the latent
-    lacks.
+    name, such as heuristic, or trained, which ships. A name is played on face_direction unless
+    --task is given; a zip file needs it unless jbrep wrote it. A run that is under way or was
+    stopped plays its last checkpoint. Of a folder only numbers are read. A zip file from elsewhere
+    runs as code when it is opened, so it needs --trust; its agent sees what the environment gives,
+    unless jbrep wrote it, or --encoder and --vecnormalize say what it was trained on. A policy by
+    name may act on what an encoder's latent is decoded to: the return that it loses measures what
+    the latent lacks.
 
     With --perturb they are a table: how much of its return a policy keeps where sensors are noisy
     or late, readings are lost, the body or the physics is another, or the robot is pushed.
@@ -319,7 +319,8 @@ def policies(as_json: bool) -> None:
     header = ("task", "observes", "learned by", "steps", *ships[0].returns)
     click.echo(table(header, rows, terminal_width()))
     episodes = len(ships[0].returns[SHIPPED])
-    return click.echo(f"\nreturns: median [10 %, 90 %] of the same {episodes} episodes")
+    click.echo(f"\nreturns: median [10 %, 90 %] of the same {episodes} episodes")
+    return tell("falling: the preset wide, but with a learning rate that falls to 0")
 
 
 @click.command(epilog="Example: jbrep behaviour runs/full runs/dae-4 --out behaviour")

@@ -11,9 +11,9 @@ from jbrep.cli.environment import (
     domain_option,
     environment_options,
     needed_task,
+    needed_task_option,
     parse_arguments,
     retries_option,
-    task_option,
 )
 from jbrep.cli.options import record_options
 from jbrep.cli.output import say, tell
@@ -62,7 +62,8 @@ def checked(options: dict[str, Any]) -> dict[str, Any]:
     """The options of a command as `jbrep.train` takes them; code that they name is imported.
 
     Args:
-        options: of `task_option`, `environment_options`, `learner_options` and `record_options`.
+        options: of `needed_task_option`, `environment_options`, `learner_options` and
+            `record_options`.
 
     Raises:
         InputError: a word is wrong, before anything heavy is imported.
@@ -92,7 +93,7 @@ def checked(options: dict[str, Any]) -> dict[str, Any]:
 @click.command(
     epilog="Example: jbrep rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a"
 )
-@task_option
+@needed_task_option
 @click.option("--out", required=True, type=PATH, help="A folder for this run.")
 @learner_options
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
@@ -159,7 +160,8 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
         if not alone and (compared := beside(task, returns, min(len(returns), _BESIDE))):
             tell(str(compared))
     source = source_of(options["encoder"], task)
-    say(f"encoder: {source}; all evaluations: {out / EVALUATIONS}")
+    tell(f"encoder: {source}; all evaluations:")
+    say(str(out / EVALUATIONS))
 
 
 def _left(folder: Path) -> str:
@@ -176,7 +178,7 @@ def _left(folder: Path) -> str:
     epilog="Example: jbrep tune --task face_direction --algorithm sac --preset modern --trials 20 "
     "--steps 20k --out runs/tune"
 )
-@task_option
+@needed_task_option
 @learner_options
 @click.option("--trials", default=20, show_default=True, type=POSITIVE, help="In all.")
 @click.option("--seeds", default=1, show_default=True, type=POSITIVE, help="Runs of each trial.")

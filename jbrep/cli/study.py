@@ -56,7 +56,7 @@ def study(
     dry_run: bool,
     register: bool,
 ) -> None:
-    """Train a grid of agents, and judge the paper's claims.
+    """Train a grid of agents, and judge the claims of a study.
 
     STUDY is a TOML file of tasks, algorithms, representations and seeds, such as those in studies/.
     Tasks are the Jitterbug's, by their names, and any environments, by their Gymnasium ids.

@@ -13,7 +13,7 @@ from jbrep.text import Table, counted, facts, html, number
 if TYPE_CHECKING:
     from jbrep.dataset.reader import Dataset
 
-_HEADER = ("feature", "unit", "min", "mean", "max", "std", "nominal")
+_HEADER = ("feature", "unit", "min", "mean", "max", "std", "usual range")
 
 
 def describe(dataset: "Dataset") -> dict[str, Any]:
@@ -127,7 +127,7 @@ def _spread(values: Any) -> dict[str, float | None]:
 
 
 def _features(dataset: "Dataset") -> list[dict[str, Any]]:
-    """Unit, extrema, mean and standard deviation of each feature, and its nominal range."""
+    """Unit, extrema, mean and standard deviation of each feature, and its usual range."""
     column = dataset["observation"]
     (low, high), (mean, std) = extrema(column.chunks()), mean_and_std(column.chunks())
     return [

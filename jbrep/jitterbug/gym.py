@@ -79,7 +79,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Args:
         task: a key of `jbrep.jitterbug.tasks.TASKS`.
-        scaled: scale features by their nominal ranges to about [-1, 1] instead of giving physical
+        scaled: scale features by their usual ranges to about [-1, 1] instead of giving physical
             units.
         form: "flat" for one array (d,), "dict" for a dictionary of observables.
         render_mode: "rgb_array", "depth_array", "human" or None.

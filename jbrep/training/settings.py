@@ -13,7 +13,7 @@ _MAX_SEED = (1 << 63) - 1  # that torch accepts
 
 Scaling = Annotated[
     Literal["extrema", "nominal", "standard", "robust"],
-    Meta(description="What becomes -1 and 1: extrema, nominal, standard or robust."),
+    Meta(description="What becomes -1 and 1: extrema, nominal (usual ranges), standard or robust."),
 ]
 On = Annotated[
     System,
