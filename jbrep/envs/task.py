@@ -378,12 +378,6 @@ class Task(Record, frozen=True):
         action = np.minimum(np.maximum(scaled, -1), 1) * ((high - low) / 2) + (high + low) / 2
         return np.minimum(np.maximum(action, low), high)  # where they round to beyond
 
-    def scale_action(self, action: NDArray[np.floating]) -> Array:
-        """The inverse of `unscale_action`; a number that can't vary is 0."""
-        low, high = self._action_bounds
-        half_width = np.where(high > low, (high - low) / 2, 1)
-        return (action - (high + low) / 2) / half_width
-
     def split(self, observation: NDArray[_Float]) -> dict[str, NDArray[_Float]]:
         """Split flat observations (..., d) by group; the parts are views."""
         return {name: observation[..., place] for name, place in self.groups.items()}
