@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jbrep.envs import instances
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
 from jbrep.envs.make import aside, flattener, number, reason
-from jbrep.envs.task import Array, Task
+from jbrep.envs.task import Array, Task, most_held
 from jbrep.errors import InputError, Notice
 
 Flags = NDArray[np.bool_]
@@ -230,7 +230,7 @@ class Separate:
         self._held[lane] += 1
         if self._task.missing == "skip" and len(self._episodes[lane].actions) > 1:
             raise _MissingError
-        if not after_step or self._held[lane] > (self._task.most_held or 0):
+        if not after_step or self._held[lane] > most_held(self._task.missing or ""):
             raise EnvironmentFailedError(
                 f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
                 f"reward that is not finite, at step {len(self._episodes[lane].actions)} of the "

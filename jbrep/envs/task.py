@@ -320,11 +320,6 @@ class Task(Record, frozen=True):
         offsets = self.offsets or {}
         return np.array([offsets.get(name, 0.0) for name in self.feature_names])
 
-    @property
-    def most_held(self) -> int | None:
-        """For how many steps the last reading stands for missing ones; None if it never does."""
-        return most_held(self.missing or "")
-
     @cached_property
     def groups(self) -> dict[str, slice]:
         """Where the features of each group stand; features without one are groups of their own."""
@@ -412,10 +407,10 @@ def _usual_range(feature: Feature) -> tuple[float, float]:
     return (low, high) if low is not None and high is not None and low < high else (-1.0, 1.0)
 
 
-def most_held(missing: str) -> int | None:
+def most_held(missing: str) -> int:
     """For how many steps the last reading stands for missing ones, by `Task.missing`."""
     kind, _, steps = missing.partition(":")
-    return int(steps) if kind == "hold" else None
+    return int(steps) if kind == "hold" else 0
 
 
 def check_same(expected: Task, actual: Task, what: str) -> None:

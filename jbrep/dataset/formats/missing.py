@@ -41,7 +41,7 @@ def without_missing(episode: Incoming, missing: str) -> Iterator[Incoming]:
     elif missing == "skip":
         yield from _whole_parts(episode._replace(missing=count))
     else:
-        held = _held(episode, most_held(missing) or 0)
+        held = _held(episode, most_held(missing))
         yield held._replace(missing=count)
 
 
