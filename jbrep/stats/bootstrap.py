@@ -35,9 +35,7 @@ def without_nan(values: Any) -> Any:
     return values if math.isfinite(values) else None
 
 
-def bootstrap(
-    statistic: Callable[..., ArrayLike], *sums: Array, resamples: int = RESAMPLES
-) -> Interval:
+def bootstrap(statistic: Callable[..., ArrayLike], *sums: Array) -> Interval:
     """A statistic of sums over all episodes with its interval, which is NaN for one episode.
 
     The resamples depend on the number of episodes alone, so statistics of the same episodes are
@@ -46,10 +44,9 @@ def bootstrap(
     Args:
         statistic: maps sums over episodes, (..., k) each, to values, (...).
         sums: for each episode, (episodes, ...) each.
-        resamples: number of resamples; each draws as many episodes as there are, with replacement.
     """
     count = len(sums[0])
-    weights = _weights(count, resamples)
+    weights = _weights(count)
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.asarray(statistic(*(np.tensordot(weights, s, 1) for s in sums)))
     if count < 2:
@@ -58,9 +55,9 @@ def bootstrap(
 
 
 @lru_cache(4)
-def _weights(count: int, resamples: int) -> Array:
+def _weights(count: int) -> Array:
     """How often each episode counts: once in the first row, then as often as it was drawn."""
-    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), resamples)
+    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), RESAMPLES)
     return np.concatenate((np.ones((1, count)), draws))
 
 

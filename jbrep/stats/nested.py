@@ -12,6 +12,9 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from jbrep.stats.bootstrap import Array, Interval
+from jbrep.stats.intervals import LEVEL
+
+_TAILS = (1 + LEVEL) / 2, (1 - LEVEL) / 2
 
 
 class Components(NamedTuple):
@@ -22,7 +25,7 @@ class Components(NamedTuple):
     ratio: Interval  # of the first to the second
 
 
-def components(returns: Array, level: float = 0.95) -> Components:
+def components(returns: Array) -> Components:
     """The variance components of returns.
 
     The interval of the runs' variance is that of chi-squared, the ratio's is exact (Searle, Casella
@@ -32,31 +35,27 @@ def components(returns: Array, level: float = 0.95) -> Components:
 
     Args:
         returns: a row for each encoder, a column for each of its runs, (e, r): at least two each.
-        level: of the intervals.
     """
     encoders, runs = returns.shape
     freedom = encoders - 1, encoders * (runs - 1)
     between = runs * float(returns.mean(axis=1).var(ddof=1))
     within = float(returns.var(axis=1, ddof=1).mean())
-    tails = (1 + level) / 2, (1 - level) / 2
     of_runs = Interval(
-        within, *(within * freedom[1] / chi2.ppf(tail, freedom[1]) for tail in tails)
+        within, *(within * freedom[1] / chi2.ppf(tail, freedom[1]) for tail in _TAILS)
     )
     quotient = between / within if within else np.inf
-    ratios = (quotient / f.ppf(tail, *freedom) for tail in tails)
+    ratios = (quotient / f.ppf(tail, *freedom) for tail in _TAILS)
     ratio = (max((each - 1) / runs, 0.0) for each in (quotient, *ratios))
-    below, above = _half_widths(between, within, freedom, level)
+    below, above = _half_widths(between, within, freedom)
     difference = between - within
     ends = (difference, difference - below, difference + above)
     of_encoders = (max(end / runs, 0.0) for end in ends)
     return Components(Interval(*of_encoders), of_runs, Interval(*ratio))
 
 
-def _half_widths(
-    between: float, within: float, freedom: tuple[int, int], level: float
-) -> tuple[float, float]:
+def _half_widths(between: float, within: float, freedom: tuple[int, int]) -> tuple[float, float]:
     """Of the interval of a difference of mean squares: to below and to above."""
-    high, low = (1 + level) / 2, (1 - level) / 2
+    high, low = _TAILS
     g1, g2 = (1 - n / chi2.ppf(high, n) for n in freedom)
     h1, h2 = (n / chi2.ppf(low, n) - 1 for n in freedom)
     f_high, f_low = f.ppf(high, *freedom), f.ppf(low, *freedom)

@@ -48,7 +48,7 @@ def behaviour_plots(
             "the arrow points in the target's direction.",
             ("policy", "x", "y", "share"),
             [row for each in behaviours for row in _cells(each)],
-            lambda: _draw_places(task, behaviours, target_yaw),
+            lambda: _draw_places(behaviours, target_yaw),
         ),
     ]
 
@@ -78,7 +78,7 @@ def _draw_motor(task: str, behaviours: Sequence[Behaviour], speeds: Array) -> Fi
     return figure
 
 
-def _draw_places(task: str, behaviours: Sequence[Behaviour], target_yaw: float) -> Figure:
+def _draw_places(behaviours: Sequence[Behaviour], target_yaw: float) -> Figure:
     rows = -(-len(behaviours) // _ACROSS)
     across = -(-len(behaviours) // rows)
     width = COLUMN if across == 1 else PAGE
