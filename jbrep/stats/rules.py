@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
+from scipy.integrate import simpson
 from scipy.optimize import brentq
 from scipy.stats import binomtest, norm
 
@@ -395,19 +395,12 @@ def levels(shares: Sequence[float], level: float) -> tuple[float, ...]:
 def _decided(shares: Sequence[float], constant: float) -> float:
     """The probability that one of the looks decides if there is no effect."""
     score, weight, before, undecided = np.zeros(1), np.ones(1), 0.0, 1.0
+    every = np.eye(_POINTS)  # of which the integrals are the weights of the points
     for share in shares:  # a score with variance t, which decides beyond C
         spread = np.sqrt(share - before)
         grid = np.linspace(-constant, constant, _POINTS)
         density = norm.pdf(grid[:, None], score, spread) @ weight
         stays = norm.cdf(constant, score, spread) - norm.cdf(-constant, score, spread)
         undecided = float(weight @ stays)
-        score, weight, before = grid, density * _simpson(grid), share
+        score, weight, before = grid, density * simpson(every, dx=grid[1] - grid[0], axis=0), share
     return 1 - undecided
-
-
-def _simpson(grid: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The weights of an integral over an odd number of evenly spaced points."""
-    weights = np.full(len(grid), 2.0)
-    weights[1::2] = 4
-    weights[[0, -1]] = 1
-    return weights * (grid[1] - grid[0]) / 3
