@@ -146,16 +146,12 @@ class Dataset:
         Raises:
             InputError: the folder exists already, or the arrays can't be used.
         """
-        from jbrep.dataset.formats.flat import source_of  # imports Gymnasium, as below
-        from jbrep.dataset.formats.writer import write
-        from jbrep.envs.description import as_task
+        from jbrep.dataset.formats.flat import source_of  # imports Gymnasium
 
         columns = {"observation": observations, "action": actions, "reward": rewards}
         columns |= {"terminated": terminations, "truncated": truncations}
         once = {"final_observation": final_observations, "seed": seeds}
-        opened = source_of(columns, once, source)
-        write(opened, Path(folder), None if task is None else as_task(task))
-        return Dataset(folder)
+        return _written(folder, source_of(columns, once, source), None, "", task)
 
     @staticmethod
     def from_table(
@@ -183,10 +179,10 @@ class Dataset:
         Raises:
             InputError: the folder exists already, or the table can't be used.
         """
-        from jbrep.dataset.formats import source_from
         from jbrep.dataset.formats.arrow import table_of
+        from jbrep.dataset.formats.logs import source_of_table
 
-        opened = source_from(table_of(table, source), layout, missing)
+        opened = source_of_table(table_of(table, source), layout, missing)
         return _written(folder, opened, layout, missing, task)
 
     @staticmethod
