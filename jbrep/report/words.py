@@ -138,10 +138,6 @@ def caveats(planned: Planned) -> list[str]:
     ]
 
 
-def _counts(verdicts: Sequence[Verdict]) -> Counter[str]:
-    return Counter(verdict.verdict for verdict in verdicts)
-
-
 def _overall(counts: Counter[str]) -> str:
     """The verdict if all agree, otherwise how many there are of each."""
     if len(counts) == 1:
@@ -165,7 +161,7 @@ def _answer(position: int, claim: Statement, analysis: Analysis) -> Answer:
         )
         for group, each in pairs
     ]
-    counts = _counts([each.verdicts[position] for _, each in pairs])
+    counts = Counter(each.verdicts[position].verdict for _, each in pairs)
     overall = _overall(counts) if counts else "no reduced state was compared"
     headline = f"{claim.statement}: {overall}"
     return Answer(claim, headline, dict(counts), findings)

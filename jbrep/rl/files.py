@@ -15,7 +15,7 @@ from jbrep.records.commit import Commits
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Version
 from jbrep.records.storage import exists
-from jbrep.records.tables import read_rows, write_csv
+from jbrep.records.tables import read_rows
 from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import (
     MAX_EPISODES,
@@ -199,17 +199,8 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     return evaluations
 
 
-def write_infos(folder: Path, rows: Sequence[Info]) -> str:
-    """Write the numbers of a run's evaluations, to the last bit; returns the file's SHA-256.
-
-    Raises:
-        InputError: it can't be written.
-    """
-    return write_csv(folder / INFOS, Info._fields, rows)
-
-
 def read_infos(folder: Path) -> list[Info]:
-    """What `write_infos` wrote; nothing where the environment tells no numbers.
+    """The numbers of a run's evaluations, to the last bit; nothing where none are told.
 
     Raises:
         InputError: as `read_run`, or the table is missing.

@@ -22,7 +22,7 @@ from jbrep.errors import InputError
 from jbrep.machine import cores
 from jbrep.records.commit import commits
 from jbrep.records.storage import exists, inside, read_file, write_whole
-from jbrep.records.tables import write_rows
+from jbrep.records.tables import write_csv, write_rows
 from jbrep.rl.agent import Evaluator, action_repeat, restore_statistics, statistics_of
 from jbrep.rl.checkpoint import CheckpointFile, History, run_settings
 from jbrep.rl.files import (
@@ -39,10 +39,10 @@ from jbrep.rl.files import (
     RUN,
     Episode,
     Evaluation,
+    Info,
     RunRecord,
     is_run,
     read_run,
-    write_infos,
 )
 from jbrep.rl.policy_file import MAX_BYTES, read
 from jbrep.rl.policy_zip import policy_zip
@@ -314,7 +314,7 @@ class Job:
             )
         }
         if self.history.infos:
-            tables[INFOS] = write_infos(self.folder, self.history.infos)
+            tables[INFOS] = write_csv(self.folder / INFOS, Info._fields, self.history.infos)
         if policy:
             write_whole(self.folder / POLICY, policy)
             write_whole(self.folder / POLICY_ZIP, policy_zip(agent, self.settings))

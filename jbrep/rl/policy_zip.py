@@ -54,12 +54,17 @@ def policy_zip(agent: BaseAlgorithm, settings: RunSettings) -> bytes:
     left_out |= {name.partition(".")[0] for name in (*names, *variables)}
     data = {name: value for name, value in vars(agent).items() if name not in left_out}
     statistics = statistics_of(agent)
+    header = ZipHeader(
+        environment=settings.environment,
+        encoder=settings.encoder,
+        representation=settings.representation,
+    )
     members: dict[str, str | bytes] = {
         "data": _to_json(data),
         "pytorch_variables.pth": _to_bytes({name: getattr(agent, name) for name in variables}),
         **{f"{name}.pth": _to_bytes(state) for name, state in agent.get_parameters().items()},
         "_stable_baselines3_version": stable_baselines3.__version__,
-        _HEADER: _header(settings).text(),
+        _HEADER: header.text(),
         **({STATISTICS: safetensors.numpy.save(statistics.tensors)} if statistics else {}),
     }
     content = io.BytesIO()
@@ -83,14 +88,6 @@ def read_metadata(raw: bytes, path: Path) -> ZipMetadata | None:
     has_statistics = STATISTICS in names
     statistics = safetensors.numpy.load(members.read(STATISTICS)) if has_statistics else {}
     return ZipMetadata(header, statistics)
-
-
-def _header(settings: RunSettings) -> ZipHeader:
-    return ZipHeader(
-        environment=settings.environment,
-        encoder=settings.encoder,
-        representation=settings.representation,
-    )
 
 
 def _to_json(data: dict[str, Any]) -> str:
