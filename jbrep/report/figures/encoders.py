@@ -28,6 +28,7 @@ from jbrep.report.figures.style import (
     family,
     family_styles,
     ink,
+    panel_grid,
     plain,
     reference,
 )
@@ -210,12 +211,8 @@ def _unit_names(encoder: Diagnostics) -> list[str]:
 
 def _draw_correlation(task: str, encoders: Encoders) -> Figure:
     across = min(3, len(encoders))
-    rows = -(-len(encoders) // across)
-    figure = Figure(figsize=(PAGE, 0.4 + (PAGE - 0.8) / max(across, 2) * rows))
-    panels = figure.subplots(rows, across, squeeze=False).ravel()
-    for axes in panels[len(encoders) :]:
-        axes.set_axis_off()
-    for axes, (label, e) in zip(panels, encoders.items(), strict=False):
+    figure, panels = panel_grid(len(encoders), (PAGE - 0.8) / max(across, 2), 0.4)
+    for axes, (label, e) in zip(panels, encoders.items(), strict=True):
         values = np.array(e.latent_units.correlation, float)
         picture = axes.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1)
         names = _unit_names(e)
@@ -225,7 +222,8 @@ def _draw_correlation(task: str, encoders: Encoders) -> Figure:
             axes.set_yticks(range(len(names)), names, size=size)
         axes.set(title=plain(label), xlabel=unit, ylabel=unit)
         bare(axes)
-    figure.colorbar(picture, ax=panels.tolist(), label="correlation", shrink=0.8, aspect=15 * rows)
+    rows = -(-len(panels) // across)
+    figure.colorbar(picture, ax=panels, label="correlation", shrink=0.8, aspect=15 * rows)
     figure.suptitle(f"{task}: correlation between latent units", size=8)
     return figure
 
