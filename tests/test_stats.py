@@ -13,7 +13,7 @@ from jbrep.report.statistics import statistics_text
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.aggregates import aggregates
 from jbrep.stats.analysis import to_plain
-from jbrep.stats.association import difference, mean_rank_correlation, rank_correlation
+from jbrep.stats.association import rank_correlation
 from jbrep.stats.comparison import probability_of_improvement
 from jbrep.stats.curves import (
     bands,
@@ -612,18 +612,6 @@ def test_families_of_codes_are_resampled_as_a_whole():
     _, low, high = rank_correlation(*twice, [*"abcdefghijklmnop"])
     assert high - low < 0.8 * (once.high - once.low)
     assert np.isnan(rank_correlation(*twice, [*"aaaabbbbccccdddd"]).low)
-
-
-def test_scores_are_compared_on_the_same_resamples():
-    """What ranks codes as another score does is above it by nothing, whatever is drawn."""
-    x, noise = np.random.default_rng(0).normal(size=(2, 12))
-    good, bad, families = [(x, x + noise)] * 2, [(noise, x)] * 2, [*"aabbccddeeff"]
-    one = rank_correlation(*good[0], families)
-    assert mean_rank_correlation(good, families) == pytest.approx(one)
-    assert difference(good, [(2 * x, x + noise)] * 2, families) == (0, 0, 0)
-    value, low, high = difference(good, bad, families)
-    assert value == pytest.approx(one.value - rank_correlation(*bad[0], families).value)
-    assert low < value < high
 
 
 def test_few_pairs_and_constant_values_say_nothing():

@@ -17,6 +17,7 @@ from jbrep.methods.registry import METHODS
 from jbrep.records.tables import write_rows
 from jbrep.rl import Run
 from jbrep.rl.files import EPISODES, Episode
+from jbrep.stats.association import rank_correlation
 from jbrep.study.tables import Return
 from jbrep.training.method import Learned
 
@@ -207,6 +208,20 @@ def test_scores_are_held_against_returns_of_the_same_encoders(tmp_path, capsys, 
     learned.write_text("code,sha256,way,final\ndae-8,of another,trees,7")
     with pytest.raises(InputError, match="dae-8 is another code than the one judged"):
         worth.main(tmp_path)
+
+
+def test_scores_are_compared_on_the_same_resamples():
+    """What ranks codes as another score does is above it by nothing, whatever is drawn."""
+    import worth
+
+    x, noise = np.random.default_rng(0).normal(size=(2, 12))
+    good, bad, families = [(x, x + noise)] * 2, [(noise, x)] * 2, [*"aabbccddeeff"]
+    one = rank_correlation(*good[0], families)
+    assert worth.mean_rank_correlation(good, families) == pytest.approx(one)
+    assert worth.difference(good, [(2 * x, x + noise)] * 2, families) == (0, 0, 0)
+    value, low, high = worth.difference(good, bad, families)
+    assert value == pytest.approx(one.value - rank_correlation(*bad[0], families).value)
+    assert low < value < high
 
 
 def test_hard_starts_are_those_where_episodes_fail(capsys):

@@ -30,7 +30,7 @@ from jbrep.evaluate.table import headline
 from jbrep.records.document import read_document
 from jbrep.report.serving import good_codes, recommended
 from jbrep.report.tables import Tables, read_tables
-from jbrep.stats.association import difference, mean_rank_correlation
+from jbrep.stats.association import correlation_of_ranks, over_families
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.study.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, interval, number
@@ -156,6 +156,26 @@ def check(evaluation: Evaluation, tables: Tables) -> None:
         code = tables.record.labels[run.label].settings.representation
         if code != FULL and evaluation.hashes.get(code) != run.encoder:
             raise InputError(f"{run.label}: agents trained on another code than the one scored")
+
+
+def mean_rank_correlation(pairs: Pairs, families: Sequence[str]) -> Interval:
+    """The mean over tasks, or runs, of rank correlations, with its interval over families."""
+    return over_families(lambda times: mean_of_ranks(pairs, times), families)
+
+
+def difference(pairs: Pairs, others: Pairs, families: Sequence[str]) -> Interval:
+    """How much the mean rank correlation of pairs is above that of others, on the same resamples.
+
+    Both are of the same codes and tasks.
+    """
+    return over_families(
+        lambda times: mean_of_ranks(pairs, times) - mean_of_ranks(others, times), families
+    )
+
+
+def mean_of_ranks(pairs: Pairs, times: Array) -> Array:
+    """The mean correlation of ranks with each code so many times, (..., n); (...)."""
+    return np.mean([correlation_of_ranks(x, y, times) for x, y in pairs], axis=0)
 
 
 def apart(task: Scored) -> Iterator[str]:

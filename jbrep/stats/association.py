@@ -85,40 +85,8 @@ def rank_correlation(x: Array, y: Array, families: Sequence[str], seed: int = 0)
     """
     if len(x) < _FEWEST or np.ptp(x) == 0 or np.ptp(y) == 0:
         return UNDEFINED
-    found = over_families(lambda times: _of_ranks(x, y, times), families, seed)
+    found = over_families(lambda times: correlation_of_ranks(x, y, times), families, seed)
     return found if len({*families}) >= _FEWEST else UNDEFINED._replace(value=found.value)
-
-
-def mean_rank_correlation(
-    pairs: Sequence[tuple[Array, Array]], families: Sequence[str], seed: int = 0
-) -> Interval:
-    """The mean over tasks of rank correlations of x and y, (n,), with its interval over families.
-
-    Args:
-        pairs: of each task, of the same codes.
-        families: that the codes belong to, (n,).
-        seed: of the resamples.
-    """
-    return over_families(lambda times: _mean_of_ranks(pairs, times), families, seed)
-
-
-def difference(
-    pairs: Sequence[tuple[Array, Array]],
-    others: Sequence[tuple[Array, Array]],
-    families: Sequence[str],
-    seed: int = 0,
-) -> Interval:
-    """How much the mean rank correlation of pairs is above that of others, on the same resamples.
-
-    Args:
-        pairs: as for `mean_rank_correlation`.
-        others: of the same codes and tasks.
-        families: that the codes belong to, (n,).
-        seed: of the resamples.
-    """
-    return over_families(
-        lambda times: _mean_of_ranks(pairs, times) - _mean_of_ranks(others, times), families, seed
-    )
 
 
 def over_families(
@@ -135,11 +103,7 @@ def over_families(
     return percentile(of_drawn, numbers, seed=seed)
 
 
-def _mean_of_ranks(pairs: Sequence[tuple[Array, Array]], times: Array) -> Array:
-    return np.mean([_of_ranks(x, y, times) for x, y in pairs], axis=0)
-
-
-def _of_ranks(x: Array, y: Array, times: Array) -> Array:
+def correlation_of_ranks(x: Array, y: Array, times: Array) -> Array:
     """Correlation of the ranks of x and y, (n,), each pair so many times, (..., n); (...)."""
     x, y = _ranks(x, times), _ranks(y, times)
     correlation: Array = (times * x * y).sum(-1) / np.sqrt(
