@@ -15,9 +15,10 @@ import numpy as np
 
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.records.storage import write_whole
+from jbrep.records.tables import write_csv
 from jbrep.rl.files import EPISODES, FINISHED, last_returns, read_evaluations, read_run, runs_below
 from jbrep.rl.policy import load_run
-from jbrep.rl.shipped import SHIPPED, Returns, file_of, shipped, write_returns
+from jbrep.rl.shipped import COLUMNS, FOLDER, RETURNS, SHIPPED, Returns, file_of, shipped
 from jbrep.rl.trained import pack
 from jbrep.stats.scale import LOOKING, STILL
 from jbrep.study.tables import REFERENCE_RETURNS, References, read_references, table_hashes
@@ -65,7 +66,13 @@ def main() -> None:
         write_whole(file_of(task), pack(load_run(run), SHIPPED))
         played[task] = {SHIPPED: np.array(learned), "heuristic": np.array(written)}
         print(f"{task}: {run}, {value:.0f} in training, at last; median {reached:.0f}")
-    write_returns(played)
+    rows = (
+        (task, policy, episode, f"{value:.3f}")
+        for task, returns in played.items()
+        for policy, values in returns.items()
+        for episode, value in enumerate(values)
+    )
+    write_csv(FOLDER / RETURNS, [*COLUMNS], rows)
 
 
 if __name__ == "__main__":

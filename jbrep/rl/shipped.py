@@ -1,6 +1,6 @@
 """The policies that ship: the best agent that was trained for each of the Jitterbug's tasks."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,13 +11,13 @@ from jbrep.errors import DamageError, InputError
 from jbrep.records import container
 from jbrep.records.document import document_from
 from jbrep.records.storage import exists
-from jbrep.records.tables import Columns, count, finite, read_csv, write_csv
+from jbrep.records.tables import Columns, count, finite, read_csv
 from jbrep.rl.files import POLICY_SUFFIX, PolicyHeader
 
 SHIPPED = "trained"  # what commands call the one that ships for their task
 FOLDER = Path(__file__).parent / "shipped"
-_RETURNS = "returns.csv"
-_COLUMNS: Columns = {"task": str, "policy": str, "episode": count, "return": finite}
+RETURNS = "returns.csv"  # of the policies that ship, and of others
+COLUMNS: Columns = {"task": str, "policy": str, "episode": count, "return": finite}
 
 Returns = Mapping[str, Array]  # by policy, in the first episodes that every run is evaluated on
 
@@ -65,21 +65,10 @@ def shipped() -> list[Shipped]:
     return found
 
 
-def write_returns(played: Mapping[str, Returns]) -> None:
-    """Write what policies return, by task."""
-    rows: Iterable[tuple[str, str, int, str]] = (
-        (task, policy, episode, f"{value:.3f}")
-        for task, returns in played.items()
-        for policy, values in returns.items()
-        for episode, value in enumerate(values)
-    )
-    write_csv(FOLDER / _RETURNS, [*_COLUMNS], rows)
-
-
 def _read_returns() -> dict[str, Returns]:
-    path = FOLDER / _RETURNS
+    path = FOLDER / RETURNS
     try:
-        rows = read_csv(path, _COLUMNS)
+        rows = read_csv(path, COLUMNS)
     except InputError as error:
         raise DamageError(f"{path} is damaged: install jbrep again") from error
     found: dict[str, dict[str, list[float]]] = {}
