@@ -22,7 +22,7 @@ from jbrep.cli.signals import stoppable
 from jbrep.encoders import find, load, save
 from jbrep.encoders.shipped import unlearned
 from jbrep.envs import describe
-from jbrep.evaluate.table import SCALARS, Diagnosed, write_diagnostics
+from jbrep.evaluate.table import SCALARS, Diagnosed, diagnostics_text
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.registry import METHODS
 from jbrep.rl.files import read_evaluations
@@ -258,7 +258,8 @@ def test_the_encoders_that_ship_are_listed(monkeypatch, tmp_path):
     given = {"forward": 0.512, "rewarded": 0.25, "reward": None}
     shas = {name: find(name, task).fingerprint for name in ("full", "pca-8")}
     rows = [Diagnosed(task.name, name, sha, given) for name, sha in shas.items()]
-    write_diagnostics(folder / "diagnostics.csv", [*rows, rows[1]._replace(sha256="another")])
+    text = diagnostics_text([*rows, rows[1]._replace(sha256="another")])
+    (folder / "diagnostics.csv").write_text(text)
     lines = jbrep("encoder", "list", "--task", "face_direction").output.splitlines()
     cells = [line.split()[:5] for line in lines[:5]]
     assert cells[1:] == [

@@ -7,8 +7,8 @@ from jbrep.evaluate.table import (
     SCALARS,
     Diagnosed,
     by_label,
+    diagnostics_text,
     read_diagnostics,
-    write_diagnostics,
 )
 
 ROWS = [
@@ -22,7 +22,7 @@ EMPTY = "," * (len(SCALARS) - 1)
 
 
 def test_the_table_comes_back_as_it_was(tmp_path):
-    write_diagnostics(tmp_path / "t.csv", ROWS)
+    (tmp_path / "t.csv").write_text(diagnostics_text(ROWS))
     unknown = dict.fromkeys(SCALARS)
     whole = [row._replace(values=unknown | row.values) for row in ROWS]
     assert read_diagnostics(tmp_path / "t.csv") == whole

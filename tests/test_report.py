@@ -23,7 +23,7 @@ from jbrep.encoders import find, save
 from jbrep.envs import describe
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError
-from jbrep.evaluate.table import DIAGNOSTICS, SCALARS, Diagnosed, write_diagnostics
+from jbrep.evaluate.table import DIAGNOSTICS, SCALARS, Diagnosed, diagnostics_text
 from jbrep.play.sources import find_episode
 from jbrep.records.document import read_document
 from jbrep.records.tables import write_csv, write_rows
@@ -379,7 +379,7 @@ def test_diagnostics_are_set_against_returns_where_they_are_known(whole, tmp_pat
     rows = [
         Diagnosed("face_direction", name, "0", {"forward": 0.1 * i}) for i, name in enumerate(FINAL)
     ]
-    write_diagnostics(tmp_path / "study" / DIAGNOSTICS, rows)
+    (tmp_path / "study" / DIAGNOSTICS).write_text(diagnostics_text(rows))
     adopt(tmp_path / "study" / RECORD, DIAGNOSTICS)
     plots = []
     monkeypatch.setattr(report, "study_plots", lambda *parts: plots.extend(study_plots(*parts)))

@@ -20,10 +20,11 @@ from jbrep.encoders.shipped import UNLEARNED
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import EVALUATION, Diagnostics, Evaluation
-from jbrep.evaluate.table import DIAGNOSTICS, Diagnosed, headline, write_diagnostics
+from jbrep.evaluate.table import DIAGNOSTICS, Diagnosed, diagnostics_text, headline
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method, name_of
 from jbrep.records.document import read_document
+from jbrep.records.tables import write_text
 from jbrep.report.evaluation import evaluation_text
 from jbrep.study.tables import evaluated
 
@@ -114,7 +115,7 @@ def ship(task: Task, files: list[Path], kinds: list[str], results: Path) -> None
         name, sha256 = file.stem, load(file).fingerprint
         if values := known.get((task.name, FULL if name == FULL else sha256)):
             rows.append(Diagnosed(task.name, name, sha256, values))
-    write_diagnostics(folder / DIAGNOSTICS, rows)
+    write_text(folder / DIAGNOSTICS, diagnostics_text(rows))
 
 
 def overview(results: Path) -> str:

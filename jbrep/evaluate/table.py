@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jbrep.evaluate.evaluation import Diagnostics, Score, Scores
-from jbrep.records.tables import Columns, csv_text, finite, read_csv, write_text
+from jbrep.records.tables import Columns, csv_text, finite, read_csv
 
 DIAGNOSTICS = "diagnostics.csv"  # of a study, or beside encoders
 Values = Mapping[str, float | None]  # by the names of SCALARS; None where it isn't known
@@ -86,15 +86,6 @@ class Diagnosed(NamedTuple):
     representation: str  # what tables call it; several encoders of a study may share a name
     sha256: str  # of the encoder
     values: Values
-
-
-def write_diagnostics(path: Path, rows: Iterable[Diagnosed]) -> str:
-    """Write the table; returns its SHA-256.
-
-    Raises:
-        InputError: it can't be written.
-    """
-    return write_text(path, diagnostics_text(rows))
 
 
 def diagnostics_text(rows: Iterable[Diagnosed]) -> str:
