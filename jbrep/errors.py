@@ -1,7 +1,8 @@
 """Exceptions for what a user can fix, and words for their messages."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from typing import Any, TypeVar
 
@@ -34,6 +35,30 @@ def kind_and_line(error: BaseException) -> str:
     """The same after the name of its class, KeyError: 'x', unless it is a user's mistake."""
     kind, line = type(error).__name__, first_line(error)
     return line if line == kind or isinstance(error, InputError) else f"{kind}: {line}"
+
+
+@contextmanager
+def refusing(
+    what: str,
+    errors: tuple[type[Exception], ...] = (Exception,),
+    *,
+    told: Callable[[Any], str] = kind_and_line,
+    kind: type[InputError] = InputError,
+) -> Iterator[None]:
+    """Let what goes wrong be a user's mistake, told in a line; one that is already, stays.
+
+    Args:
+        what: failed, or can't be, for the message.
+        errors: that may come of it.
+        told: what says in a line why.
+        kind: of the error that is raised instead.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except errors as error:
+        raise kind(f"{what}: {told(error)}") from error
 
 
 def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.envs.task import Task
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import InputError, kind_and_line, refusing
 
 Float32 = NDArray[np.float32]
 
@@ -208,12 +208,8 @@ class OwnEncoder(BaseEncoder):
     def check_task(self, task: Task) -> None:
         """Ask its own `check_task`, if it has one, else compare the number of features."""
         if check := self._has("check_task"):
-            try:
+            with refusing(f"{self.name} refuses {task.name}", told=_reason):
                 check(task)
-            except InputError:
-                raise
-            except Exception as error:
-                raise InputError(f"{self.name} refuses {task.name}: {_reason(error)}") from error
         elif task.size != self.size:
             raise InputError(
                 f"{self.name} takes observations of {self.size} numbers, but {task.name} has "

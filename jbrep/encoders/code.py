@@ -7,7 +7,7 @@ from typing import Any
 from jbrep.encoders.base import BaseEncoder, as_encoder
 from jbrep.envs.names import code_named
 from jbrep.envs.task import Task
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import refusing
 
 
 def make(name: str | Path, task: Task) -> BaseEncoder:
@@ -17,14 +17,10 @@ def make(name: str | Path, task: Task) -> BaseEncoder:
         InputError: its module wasn't imported on request, it has no such name, the call fails, or
             as `as_encoder`.
     """
-    try:
+    with refusing(f"can't make the encoder {name}"):
         thing = code_named(str(name), "encoder")
         if _makes(thing):
             thing = thing()
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"can't make the encoder {name}: {kind_and_line(error)}") from error
     return as_encoder(thing, task)
 
 

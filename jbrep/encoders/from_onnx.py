@@ -20,7 +20,7 @@ from jbrep.encoders.fold import Action, Chain, Value, refusal
 from jbrep.encoders.layers import EPSILON, Layer
 from jbrep.encoders.operations import NOTHING, VALUE, check_first_alone, operation, with_slope
 from jbrep.envs.task import Task
-from jbrep.errors import InputError, first_line
+from jbrep.errors import InputError, first_line, refusing
 from jbrep.records.storage import exists, read_file
 from jbrep.text import counted
 
@@ -93,18 +93,14 @@ def _read(path: Path) -> tuple[onnx.ModelProto, Constants]:
         InputError: there is no such file, or it isn't an ONNX model that can be read.
     """
     model = onnx.ModelProto()
-    try:
+    what = f"{path} isn't an ONNX model that can be read"
+    with refusing(what, _UNREADABLE, told=first_line):
         model.ParseFromString(_bytes(path))
         if len(model.graph.node) > _MAX_NODES:
             raise InputError(f"{path} has more than {_MAX_NODES} nodes")
         _fetch_all(model.graph.initializer, path.parent)
         onnx.checker.check_model(model)
         return model, {tensor.name: _array(tensor) for tensor in model.graph.initializer}
-    except InputError:
-        raise
-    except _UNREADABLE as error:
-        reason = first_line(error)
-        raise InputError(f"{path} isn't an ONNX model that can be read: {reason}") from None
 
 
 def _array(tensor: TensorProto) -> NDArray[np.generic]:

@@ -35,7 +35,7 @@ from jbrep.envs.task import (
     Word,
 )
 from jbrep.envs.view import with_view
-from jbrep.errors import InputError, Notice
+from jbrep.errors import InputError, Notice, refusing
 from jbrep.records.record import Finite, Record, converted, from_plain
 from jbrep.records.toml import read_toml
 from jbrep.text import words
@@ -121,16 +121,11 @@ def _describe(
     spec, given = find_spec(name), json.loads(arguments)
     if max_episode_steps is not None:
         converted(max_episode_steps, EpisodeSteps, "the number of steps in an episode")
-    try:
-        with aside():
-            if own := getattr(creator(spec), "describe", None):
-                described: Task = own({**spec.kwargs, **given}, max_episode_steps)
-                return described, None
-            return _probe(spec.id, given, max_episode_steps)
-    except InputError:
-        raise
-    except Exception as error:  # whatever the environment raises
-        raise InputError(f"{spec.id} failed when it was tried: {reason(error)}") from error
+    with refusing(f"{spec.id} failed when it was tried", told=reason), aside():
+        if own := getattr(creator(spec), "describe", None):
+            described: Task = own({**spec.kwargs, **given}, max_episode_steps)
+            return described, None
+        return _probe(spec.id, given, max_episode_steps)
 
 
 def _probe(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jbrep.envs.names import find_spec, spec_of
 from jbrep.envs.task import Task
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import kind_and_line, refusing
 
 Flatten = Callable[[Any], NDArray[Any]]
 
@@ -65,14 +65,9 @@ def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv
 @contextmanager
 def _making(env_id: str, arguments: Mapping[str, Any]) -> Iterator[None]:
     """Say in a line why an environment can't be made."""
-    try:
-        with _quiet(), aside():
-            yield
-    except InputError:
-        raise
-    except Exception as error:
-        given = f" with {dict(arguments)}" if arguments else ""
-        raise InputError(f"can't make {env_id}{given}: {reason(error)}") from error
+    given = f" with {dict(arguments)}" if arguments else ""
+    with refusing(f"can't make {env_id}{given}", told=reason), _quiet(), aside():
+        yield
 
 
 def is_batched(task: Task) -> bool:

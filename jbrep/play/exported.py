@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from jbrep.envs.recording import Actor, held
 from jbrep.envs.task import Array, Task, check_same
-from jbrep.errors import DamageError, InputError, first_line
+from jbrep.errors import DamageError, InputError, first_line, refusing
 from jbrep.play.player import Player
 from jbrep.records.storage import read_file
 from jbrep.rl.policy_file import MAX_BYTES
@@ -34,13 +34,9 @@ def read_exported(path: Path) -> tuple[Any, Described]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    try:
+    what = f"{path} isn't an ONNX model that can be run"
+    with refusing(what, told=first_line, kind=DamageError):
         session = onnxruntime.InferenceSession(read_file(path, MAX_BYTES), options)
-    except InputError:
-        raise
-    except Exception as error:  # of several classes
-        said = first_line(error)
-        raise DamageError(f"{path} isn't an ONNX model that can be run: {said}") from None
     text = session.get_modelmeta().custom_metadata_map.get("jbrep", "")
     try:
         return session, msgspec.json.decode(text, type=Described)

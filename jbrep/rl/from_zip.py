@@ -19,7 +19,7 @@ from jbrep.encoders import find
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.shipped import unscaled
 from jbrep.envs.task import Array, Task, check_same
-from jbrep.errors import InputError
+from jbrep.errors import InputError, refusing
 from jbrep.records.storage import read_file
 from jbrep.rl.agent import action_repeat, is_action_scaled, one_line
 from jbrep.rl.normalization import Statistics
@@ -129,21 +129,16 @@ def _loaded(raw: bytes, path: Path, algorithm: str) -> tuple[BaseAlgorithm, ZipM
     kind = sb3_class(algorithm)
     if not zipfile.is_zipfile(io.BytesIO(raw)):
         raise InputError(f"{path} isn't a {algorithm} policy: it isn't a zip file")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of schedules that another Python pickled
-            # what only training needs: memory, or an environment to be made with
-            unused: dict[str, Any] = {
-                "buffer_size": 1,
-                "replay_buffer_class": None,
-                "replay_buffer_kwargs": {},
-            }
-            agent = kind.load(io.BytesIO(raw), device="cpu", custom_objects=unused)
+    with refusing(f"{path} isn't a {algorithm} policy", told=one_line), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of schedules that another Python pickled
+        # what only training needs: memory, or an environment to be made with
+        unused: dict[str, Any] = {
+            "buffer_size": 1,
+            "replay_buffer_class": None,
+            "replay_buffer_kwargs": {},
+        }
+        agent = kind.load(io.BytesIO(raw), device="cpu", custom_objects=unused)
         return agent, read_metadata(raw, path)
-    except InputError:
-        raise
-    except Exception as error:  # whatever its pickled parts do
-        raise InputError(f"{path} isn't a {algorithm} policy: {one_line(error)}") from None
 
 
 def _check_observations(space: spaces.Space[Any], seen: BaseEncoder, path: Path) -> None:
@@ -181,17 +176,11 @@ def _shown(bounds: NDArray[np.float32]) -> str:
 
 def _statistics(path: Path, space: spaces.Space[Any]) -> Statistics | None:
     """What a VecNormalize normalises observations by, flat; None if it leaves them as they are."""
-    try:
+    with refusing(f"{path} isn't what VecNormalize.save wrote for this policy", told=one_line):
         normalizer = pickle.loads(read_file(path.resolve(), MAX_BYTES))
         if not isinstance(normalizer, VecNormalize):
             raise TypeError(f"it holds a {type(normalizer).__name__}")
         return _read(normalizer, space) if normalizer.norm_obs else None
-    except InputError:
-        raise
-    except Exception as error:  # whatever its pickled parts do
-        raise InputError(
-            f"{path} isn't what VecNormalize.save wrote for this policy: {one_line(error)}"
-        ) from None
 
 
 def _read(normalizer: VecNormalize, space: spaces.Space[Any]) -> Statistics:
