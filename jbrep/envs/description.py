@@ -16,7 +16,7 @@ from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from jbrep.envs import instances
-from jbrep.envs.make import aside, creator, flattener, number, reason
+from jbrep.envs.make import aside, creator, random_play, reason
 from jbrep.envs.mujoco import with_kinds
 from jbrep.envs.names import find_spec
 from jbrep.envs.origin import absolute, code_of, files_of
@@ -301,27 +301,10 @@ class _Played(NamedTuple):
 
 
 def _play(env: gymnasium.Env[Any, Any], seed: int) -> _Played:
-    random = np.random.default_rng(seed)
-    space: Any = env.action_space
-    observation, info = env.reset(seed=seed)
-    if not isinstance(info, Mapping):
-        raise ValueError("too many values to unpack (expected 2")  # old Gym's
-    flat = [_flat(env, observation)]
-    content, ends = [flat[0].tobytes()], (False, False)
-    for _ in range(_PROBE_STEPS):
-        action = random.uniform(space.low, space.high).astype(space.dtype)
-        observation, reward, terminated, truncated, _ = env.step(action)
-        ends = bool(number(terminated, "terminated")), bool(number(truncated, "truncated"))
-        flat.append(_flat(env, observation))
-        told = np.array([number(reward, "reward"), *ends])
-        content.append(flat[-1].tobytes() + told.tobytes())
-        if any(ends):
-            break
-    return _Played(content, np.array(flat, np.float64), ends[0])
-
-
-def _flat(env: gymnasium.Env[Any, Any], observation: Any) -> NDArray[Any]:
-    return np.array(flattener(env.observation_space)(observation))
+    steps = [*random_play(env, seed, _PROBE_STEPS)]
+    content = [flat.tobytes() + np.array(told).tobytes() for flat, *told in steps]
+    observations = np.array([each.observation for each in steps], np.float64)
+    return _Played(content, observations, steps[-1].terminated)
 
 
 class _FeatureChanges(Record, frozen=True):

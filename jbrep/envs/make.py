@@ -5,7 +5,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -102,6 +102,32 @@ def flattener(space: spaces.Space[Any]) -> Flatten:
         each = [flattener(part) for part in space.spaces]
         return lambda given: np.concatenate([f(part) for f, part in zip(each, given, strict=True)])
     return lambda given: np.asarray(flatten(space, given))
+
+
+class Step(NamedTuple):
+    """What an environment gives."""
+
+    observation: NDArray[Any]  # flat, (d,)
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+def random_play(env: gymnasium.Env[Any, Any], seed: int, most: int) -> Iterator[Step]:
+    """The first observation of an episode, and up to so many steps under random actions."""
+    random, flat = np.random.default_rng(seed), flattener(env.observation_space)
+    space: Any = env.action_space
+    observation, info = env.reset(seed=seed)
+    if not isinstance(info, Mapping):
+        raise ValueError("too many values to unpack (expected 2")  # old Gym's
+    yield Step(np.array(flat(observation)), 0.0, False, False)
+    for _ in range(most):
+        action = random.uniform(space.low, space.high).astype(space.dtype)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        ends = bool(number(terminated, "terminated")), bool(number(truncated, "truncated"))
+        yield Step(np.array(flat(observation)), number(reward, "reward"), *ends)
+        if any(ends):
+            break
 
 
 def aside() -> redirect_stdout[Any]:

@@ -4,14 +4,15 @@ Nothing is guessed: a feature is what it equals in all states of some episodes t
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 import gymnasium
 import mujoco
 import numpy as np
-from gymnasium.spaces.utils import flatten
 from numpy.typing import NDArray
 
+from jbrep.envs.make import random_play
 from jbrep.envs.task import SPATIAL, Feature, Frame, Kind
 
 Array = NDArray[np.float64]
@@ -126,20 +127,12 @@ def _planar_root(model: mujoco.MjModel) -> tuple[int, int, int] | None:
 def _played(env: gymnasium.Env[Any, Any]) -> tuple[Array, Array]:
     """Observations (n, d) and states (n, nq + nv) of some episodes under random actions."""
     observations, states = [], []
-    space: Any = env.action_space
     for episode in range(_EPISODES):
-        random = np.random.default_rng(episode)
-        env.reset(seed=episode)
-        for _ in range(_STEPS):
-            action = random.uniform(space.low, space.high).astype(space.dtype)
-            observation, _, terminated, truncated, _ = env.step(action)
-            flat: Any = flatten(env.observation_space, observation)
-            observations.append(np.array(flat, np.float64))
+        for step in islice(random_play(env, episode, _STEPS), 1, None):
+            observations.append(step.observation)
             data = physics_of(env).data  # type: ignore[union-attr] # it may be another after a reset
             states.append(np.concatenate((data.qpos, data.qvel)))
-            if terminated or truncated:
-                break
-    return np.array(observations), np.array(states)
+    return np.array(observations, np.float64), np.array(states)
 
 
 def _match(column: Array, states: Array, quantities: dict[int, _Quantity]) -> _Quantity | None:
