@@ -1,5 +1,7 @@
 """Training one agent, and a search for an algorithm's settings."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -136,17 +138,12 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
         from jbrep.encoders.shipped import source_of
         from jbrep.envs.infos import shares_text
         from jbrep.envs.make import is_one_robot
-        from jbrep.rl.checkpoint import StoppedError  # imports torch
         from jbrep.rl.files import EVALUATIONS, last_infos, read_evaluations, read_infos
         from jbrep.study.single import beside
 
         task = options["task"]
-        try:
+        with _told_when_stopped(received, f"; {RESUMES}" if task.reproducible else ""):
             agent = api.train(out=out, stop=lambda: bool(received), **options)
-        except StoppedError as error:
-            resumes = f"; {RESUMES}" if task.reproducible else ""
-            click.echo(f"{error}{resumes}", err=True)
-            context.exit(128 + received[0])  # as a shell reports a command that a signal ended
     if agent.record.reason is not None:
         click.echo(f"the run failed: {agent.record.reason}; {_left(out)}", err=True)
         context.exit(1)
@@ -189,8 +186,7 @@ def _left(folder: Path) -> str:
 @click.option("--out", required=True, type=PATH, help="A folder for this search.")
 @domain_option
 @environment_options
-@click.pass_context
-def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **options: Any) -> None:
+def tune(out: Path, trials: int, seeds: int, **options: Any) -> None:
     """Search for an algorithm's settings with Optuna.
 
     Learning rate, batch size, discount, layers and others of the algorithm are searched, but for
@@ -201,7 +197,7 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **option
     with stop_signals() as received:
         steps, episodes = options["steps"], options["evaluation_episodes"]
         options = checked(options)
-        from jbrep.rl import Run, StoppedError  # imports torch, after all words are known
+        from jbrep.rl import Run  # imports torch, after all words are known
         from jbrep.rl.tune import BEST, Trial
         from jbrep.rl.tune import tune as search
 
@@ -210,13 +206,22 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **option
             click.echo(f"trial {trial.number + 1} of {trials}: {score}  {_shown(trial.overrides)}")
 
         run = Run.of(**options, evaluate_every=steps, final_episodes=episodes)
-        try:
+        with _told_when_stopped(received, f" of a trial; {RESUMES}"):
             best = search(run, trials, seeds, out, show, stop=lambda: bool(received))
-        except StoppedError as error:
-            click.echo(f"{error} of a trial; {RESUMES}", err=True)
-            context.exit(128 + received[0])
     click.echo(f"\nbest: trial {best.number + 1}, {_shown(best.overrides)}")
     click.echo(f"as a preset, for --preset: {out / BEST}")
+
+
+@contextmanager
+def _told_when_stopped(received: list[int], more: str) -> Iterator[None]:
+    """End the command once a signal has stopped what it trains, as a shell reports it."""
+    from jbrep.rl.checkpoint import StoppedError  # imports torch
+
+    try:
+        yield
+    except StoppedError as error:
+        click.echo(f"{error}{more}", err=True)
+        raise SystemExit(128 + received[0]) from None
 
 
 def _shown(overrides: dict[str, Any]) -> str:
