@@ -10,7 +10,6 @@ from typing import Annotated, Any, ClassVar
 from msgspec import Meta
 
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
-from jbrep.dataset.settings import Digest
 from jbrep.dataset.shard import (
     REPAIR,
     Checked,
@@ -25,7 +24,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
 from jbrep.records.commit import Commits, commits
 from jbrep.records.document import Document, document_from, parse_json
-from jbrep.records.record import Record, Version
+from jbrep.records.record import Record, Sha256, Version
 from jbrep.records.storage import MissingFileError, exists, read_regular, write_whole
 
 MANIFEST = "manifest.json"
@@ -43,7 +42,7 @@ class Entry(Record, frozen=True, kw_only=True):
     rows: _Count
     episodes: _Count
     xxh3: Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z", title="an XXH3")]  # of the file
-    sha256: Mapping[str, Digest]  # of each column
+    sha256: Mapping[str, Sha256]  # of each column
 
 
 class Manifest(Document, frozen=True, kw_only=True):

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from jbrep.errors import InputError
-from jbrep.records.record import Record, converted
+from jbrep.records.record import Record, Sha256, converted
 
 IMPORTED = "imported"  # data that were made elsewhere
 MIXTURE = "mixture"  # a policy for each episode, by weights
@@ -16,7 +16,6 @@ MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 
 _MAX_CONSTANTS = 1000
 
-Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="a SHA-256")]
 _Line = Annotated[str, Meta(max_length=MAX_LETTERS)]
 _Number = Annotated[float, Meta(gt=-(10**12), lt=10**12, title="a number")]
 _List = Annotated[tuple[_Number | _Line, ...], Meta(max_length=_MAX_CONSTANTS)]
@@ -78,7 +77,7 @@ class _Trained(Record, frozen=True, kw_only=True):
     file: Annotated[
         str, Meta(pattern=r"(?a)\Apolicy-\d{1,3}\.safetensors\Z", title="policy-0.safetensors")
     ]
-    sha256: Digest
+    sha256: Sha256
     run: _Line
     step: Annotated[int, Meta(ge=0, lt=10**12)]
 

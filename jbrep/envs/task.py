@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jbrep.envs.domain import Domain
 from jbrep.errors import InputError
-from jbrep.records.record import Finite, Record
+from jbrep.records.record import Finite, Record, Sha256
 from jbrep.text import slug
 
 Array = NDArray[np.float64]
@@ -56,7 +56,6 @@ SPATIAL: Mapping[Kind, range] = {  # kinds of several features, a group of their
     "point": range(2, 4),
 }
 _Positive = Annotated[float, Meta(gt=0, le=1e12)]
-_Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="a SHA-256")]
 _Part = Annotated[str, Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]{1,200}\Z", title="a name")]
 Missing = Annotated[
     str,
@@ -234,7 +233,7 @@ class Task(Record, frozen=True):
     draws: Annotated[int, Meta(ge=0, lt=1 << 32)] | None = None
     state: _Arrays = {}
     constants: _Arrays = {}
-    made_from: Mapping[_Part, _Sha256] | UnsetType = UNSET  # left out of files that have none
+    made_from: Mapping[_Part, Sha256] | UnsetType = UNSET  # left out of files that have none
     offsets: Mapping[Word, Finite] | UnsetType = UNSET
     missing: Missing | UnsetType = UNSET
     view: View | UnsetType = UNSET

@@ -31,6 +31,7 @@ Version = Annotated[
     str,
     Meta(pattern=r"(?a)\A\w[\w.+!-]*\Z", title="a version, or the name of a package"),
 ]
+Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="64 hexadecimal digits")]
 
 _AT = re.compile(r"(?P<reason>.*?)(?: - at `\$(?P<path>.*)`)?", re.DOTALL)
 _MISSING = re.compile(r"Object missing required field `(.*)`")

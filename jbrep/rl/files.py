@@ -13,7 +13,7 @@ from jbrep.errors import DamageError, InputError
 from jbrep.records import container
 from jbrep.records.commit import Commits
 from jbrep.records.document import Document, read_document
-from jbrep.records.record import Version
+from jbrep.records.record import Sha256, Version
 from jbrep.records.storage import exists
 from jbrep.records.tables import read_rows
 from jbrep.rl.run_settings import RunSettings
@@ -22,7 +22,6 @@ from jbrep.rl.settings import (
     MAX_STEPS,
     Line,
     Name,
-    Sha256,
 )
 
 POLICY_SUFFIX = ".safetensors"

@@ -13,7 +13,7 @@ from jbrep.envs.description import as_task
 from jbrep.envs.names import is_code
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.records.record import to_plain
+from jbrep.records.record import Sha256, to_plain
 from jbrep.rl.cohort import ALGORITHMS
 from jbrep.rl.cohort.algorithm import check as check_for_cohort
 from jbrep.rl.learner import Learner
@@ -29,7 +29,6 @@ from jbrep.rl.settings import (
     SB3,
     Name,
     Seed,
-    Sha256,
     TrainingSettings,
 )
 from jbrep.training.trainer import get_device, single_torch_thread

@@ -8,7 +8,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from jbrep.envs.task import Id, Task, changed_parts
 from jbrep.errors import InputError, differences
-from jbrep.records.record import to_plain
+from jbrep.records.record import Sha256, to_plain
 from jbrep.rl.presets import LINEAR, Hyperparameters, learns_from
 from jbrep.rl.settings import (
     CLASSES,
@@ -17,7 +17,6 @@ from jbrep.rl.settings import (
     Line,
     Name,
     Seed,
-    Sha256,
     Steps,
     TrainingSettings,
 )

@@ -29,7 +29,6 @@ MAX_LINE = 1000  # letters
 MAX_NAME = 100  # letters of a learner's name
 
 Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
-Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="64 hexadecimal digits")]
 Name = Annotated[
     str,
     Meta(

@@ -15,11 +15,10 @@ from jbrep.encoders.base import OWN
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.document import Document
-from jbrep.records.record import MOST_WHOLE, Record, Version, from_plain, to_plain
+from jbrep.records.record import MOST_WHOLE, Record, Sha256, Version, from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, RunRecord
 from jbrep.rl.run_settings import RunSettings, SharedSettings
-from jbrep.rl.settings import Sha256
 from jbrep.stats.rules import Rules
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study

@@ -33,14 +33,13 @@ from jbrep.dataset.formats.hdf5 import opened
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.rewards import without_range
 from jbrep.dataset.schema import UNKNOWN_SEED, DataSettings
-from jbrep.dataset.settings import Digest
 from jbrep.envs.description import describe, features_of
 from jbrep.envs.names import spec_of
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, kind_and_line, listed
 from jbrep.progress import Progress
 from jbrep.records.document import Document, read_document
-from jbrep.records.record import Finite
+from jbrep.records.record import Finite, Sha256
 from jbrep.records.storage import (
     exists,
     inside,
@@ -69,7 +68,7 @@ class Checksums(Document, frozen=True, kw_only=True):
     format = "jbrep export"
     format_version = 1
 
-    files: Mapping[str, Digest]
+    files: Mapping[str, Sha256]
     offsets: tuple[Finite, ...] = ()
     own_rewards: Literal[True] | UnsetType = UNSET
 

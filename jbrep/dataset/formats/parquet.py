@@ -22,12 +22,11 @@ from jbrep.dataset.formats.episodes import ENDS, label
 from jbrep.dataset.formats.flat import CHUNK, per_episode
 from jbrep.dataset.formats.tables import Table, with_offsets, with_widths
 from jbrep.dataset.reader import Dataset
-from jbrep.dataset.settings import Digest
 from jbrep.envs.task import MAX_FEATURES, Task
 from jbrep.errors import DamageError, InputError, first_line
 from jbrep.progress import Progress
 from jbrep.records.document import Document, document_in
-from jbrep.records.record import from_plain
+from jbrep.records.record import Sha256, from_plain
 from jbrep.records.storage import (
     exists,
     publish_file,
@@ -51,9 +50,9 @@ class Checksums(Document, frozen=True, kw_only=True):
     format = "jbrep table"
     format_version = 1
 
-    settings: Digest  # of the text of the data set's settings, also in the metadata
+    settings: Sha256  # of the text of the data set's settings, also in the metadata
     columns: Mapping[str, str]  # XXH3 of the numbers of each
-    episodes: Digest  # of the file of episodes
+    episodes: Sha256  # of the file of episodes
 
 
 def open_table(given: str) -> Table:
