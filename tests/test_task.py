@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from command import jbrep
 
+from jbrep.cli.environment import parse_arguments
 from jbrep.dataset.schema import episode_seed
 from jbrep.envs import Feature, Lanes, Task, describe
 from jbrep.envs.names import import_modules, imported_modules, name_given
@@ -351,6 +352,15 @@ def test_a_mistaken_file_of_features_is_refused_in_one_line(text, message, tmp_p
     assert "\n" not in str(refusal.value)
     with pytest.raises(InputError, match=r"can't read .*none"):
         describe(SLEDGE, features=tmp_path / "none")
+
+
+def test_arguments_are_shown_as_the_command_line_takes_them():
+    texts = {"mode": "fast, or not", "number": "7", "nothing": "null", "empty": "", "lines": "a\nb"}
+    arguments = {**texts, "wind": 0.5, "still": True, "path": ["a", None], "sizes": {"x": 1}}
+    shown = PLAIN.replace(arguments=arguments).given_arguments
+    assert shown[:3] == ["mode=fast, or not", 'number="7"', 'nothing="null"']
+    assert not [each for each in shown if "\n" in each]
+    assert parse_arguments(shown) == arguments
 
 
 def test_a_command_says_what_is_missing(tmp_path):

@@ -134,12 +134,10 @@ def _notes(
     encoders: "Mapping[str, BaseEncoder]", sources: Mapping[str, str], evaluation: "Evaluation"
 ) -> list[str]:
     """Where encoders come from, and which may have seen the episodes that they were judged on."""
-    from jbrep.encoders.card import arguments_of
-
     taken = []
     for label, source in sources.items():
         line = source if source.startswith(label) else f"{label}: {source}"
-        arguments = arguments_of(encoders[label].task)
+        arguments = ", ".join(encoders[label].task.given_arguments)
         taken.append(f"{line}, made with {arguments}" if arguments else line)
     notes = [f"Judged: {'; '.join(taken)}."]
     if maybe := [label for label, seen in evaluation.seen.items() if seen == "maybe"]:

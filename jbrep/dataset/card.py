@@ -96,8 +96,7 @@ def _facts(dataset: "Dataset", about: Mapping[str, Any]) -> dict[str, str]:
 
 def _task_line(task: Task) -> str:
     parts = [task.name, counted(task.size, "feature"), counted(task.action_size, "action")]
-    arguments = [f"{name}={value}" for name, value in task.arguments.items()]
-    return ", ".join([*parts, *arguments])
+    return ", ".join([*parts, *task.given_arguments])
 
 
 def _episodes_line(about: Mapping[str, Any]) -> str:

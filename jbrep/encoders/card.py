@@ -1,13 +1,12 @@
 """An encoder's card: what it is, where it comes from, what it reads."""
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.layers import Layer
-from jbrep.envs.task import Feature, Task
+from jbrep.envs.task import Feature
 from jbrep.text import facts, table
 
 _RECORDS = ("training", "data", "metrics", "versions")
@@ -59,7 +58,7 @@ def card(encoder: BaseEncoder, source: str, width: int) -> str:
     lines = {
         "source": source,
         "task": f"{told['task']}, {told['size']} features to {told['latent_size']}",
-        "environment": ", ".join(filter(None, (encoder.task.id, arguments_of(encoder.task)))),
+        "environment": ", ".join([encoder.task.id, *encoder.task.given_arguments]),
         "kind": told["kind"],
     }
     if not isinstance(encoder, Encoder):
@@ -83,14 +82,6 @@ def card(encoder: BaseEncoder, source: str, width: int) -> str:
 def _read(encoder: Encoder) -> tuple[Feature, ...]:
     """What it scales and encodes."""
     return encoder.scaler.features(encoder.task)
-
-
-def arguments_of(task: Task) -> str:
-    """The arguments of a task's environment as a command line takes them: body=7, g=1.6."""
-    return ", ".join(
-        f"{name}={value if isinstance(value, str) else json.dumps(value)}"
-        for name, value in task.arguments.items()
-    )
 
 
 def _layers(layers: tuple[Layer, ...]) -> list[dict[str, Any]]:

@@ -23,7 +23,7 @@ def _facts(task: Task) -> Iterator[tuple[str, str]]:
     if task.name != task.id:
         yield "id", task.id
     if task.arguments:
-        yield "arguments", ", ".join(f"{n}={value}" for n, value in task.arguments.items())
+        yield "arguments", ", ".join(task.given_arguments)
     yield "observation", counted(task.size, "feature")
     yield "action", f"{counted(task.action_size, 'number')} in {_bounds(task)}"
     step = "" if task.timestep is None else f" of {task.timestep:g} s"

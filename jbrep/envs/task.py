@@ -319,6 +319,11 @@ class Task(Record, frozen=True):
         offsets = self.offsets or {}
         return np.array([offsets.get(name, 0.0) for name in self.feature_names])
 
+    @property
+    def given_arguments(self) -> list[str]:
+        """The arguments of its environment, each as `--env` takes it: body=7."""
+        return [f"{name}={_as_text(value)}" for name, value in self.arguments.items()]
+
     @cached_property
     def groups(self) -> dict[str, slice]:
         """Where the features of each group stand; features without one are groups of their own."""
@@ -404,6 +409,16 @@ def _usual_range(feature: Feature) -> tuple[float, float]:
     """That of a feature, or one by which it isn't scaled."""
     low, high = feature.low, feature.high
     return (low, high) if low is not None and high is not None and low < high else (-1.0, 1.0)
+
+
+def _as_text(value: Any) -> str:
+    """JSON, or a text as it is where it can't be taken for JSON."""
+    if isinstance(value, str) and value.isprintable():
+        try:
+            json.loads(value)
+        except (ValueError, RecursionError):
+            return value
+    return json.dumps(value)
 
 
 def most_held(missing: str) -> int:

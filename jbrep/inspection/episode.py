@@ -70,7 +70,7 @@ def provenance(rollout: Rollout, encoder: BaseEncoder | None, more: str = "") ->
     """The origin of an episode and its encoder as Markdown, and more of it below."""
     facts = {"task": rollout.task.name}
     if rollout.task.arguments:
-        facts["arguments"] = f"`{dict(rollout.task.arguments)}`"
+        facts["arguments"] = f"`{', '.join(rollout.task.given_arguments)}`"
     facts |= {
         "seed": f"{rollout.seed}",
         "steps": f"{len(rollout):,}",

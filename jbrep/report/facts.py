@@ -310,8 +310,8 @@ def _command(shared: Label, folder: str, encoder: str) -> str:
         parts += ["--import", name]
     for name, value in settings.overrides.items():
         parts += ["--set", f"{name}={json.dumps(value)}"]
-    for name, value in task.arguments.items():
-        parts += ["--env", f"{name}={json.dumps(value)}"]
+    for each in task.given_arguments:
+        parts += ["--env", each]
     for each in str(task.domain or "").split(","):
         parts += ["--domain", each] if each else []
     parts += ["--episode-steps", str(task.max_episode_steps)]

@@ -241,8 +241,7 @@ def _prevented(record: RunsRecord, references: References, rules: Rules) -> dict
 
 def _environment(task: Task) -> str:
     """What decides which returns there can be, as text for a message."""
-    arguments = [f"{name}={value!r}" for name, value in task.arguments.items()]
-    return ", ".join([task.id, *arguments, counted(task.max_episode_steps, "step")])
+    return ", ".join([task.id, *task.given_arguments, counted(task.max_episode_steps, "step")])
 
 
 def _mean(returns: Sequence[float]) -> float | None:
