@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from tensors import TensorWindows
+from tensors import TensorWindows, torch_threads
 from torch.nn.functional import mse_loss
 
 from jbrep.dae import AE, DAE
@@ -157,15 +157,11 @@ def test_training_comes_near_the_bound_of_linear_codes(architecture):
 
 
 def test_the_same_seed_gives_the_same_weights_whatever_the_threads():
-    before = torch.get_num_threads()
     one = weights(trained(seed=1))
     torch.manual_seed(99)  # what the caller drew must not matter
-    torch.set_num_threads(2)
-    try:
+    with torch_threads(2):
         assert torch.equal(one, weights(trained(seed=1)))
         assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
     assert not torch.equal(one, weights(trained(seed=2)))
 
 

@@ -16,6 +16,7 @@ import torch
 from command import jbrep, start, wait_for
 from small import settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensors import torch_threads
 from threadpoolctl import threadpool_limits
 from wide import wide
 
@@ -371,13 +372,9 @@ def test_noise_counts_over_what_symmetry_tells(data):
 def test_an_encoder_has_the_same_bytes_whatever_the_number_of_threads(kind, data, tmp_path):
     made = []
     for threads in (1, 2):
-        torch.set_num_threads(threads)
-        try:
-            with threadpool_limits(threads, "blas"):
-                fresh = ScaledDataset(Dataset(data.dataset.folder))
-                made.append(Fitter(fresh, tmp_path / str(threads)).fit(kind, **how(kind)).path)
-        finally:
-            torch.set_num_threads(1)
+        with torch_threads(threads), threadpool_limits(threads, "blas"):
+            fresh = ScaledDataset(Dataset(data.dataset.folder))
+            made.append(Fitter(fresh, tmp_path / str(threads)).fit(kind, **how(kind)).path)
     assert made[0].read_bytes() == made[1].read_bytes()
 
 

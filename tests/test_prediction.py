@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from sklearn.metrics import r2_score
+from tensors import torch_threads
 from wide import make_feature, make_task
 
 from jbrep.coordinates import wrapped
@@ -350,10 +350,8 @@ def test_regression_finds_what_is_not_linear_and_repeats_to_the_last_bit(monkeyp
     assert r2_score(wanted[15_000:, 0], twice[0][:, 0]) > 0.95
     assert r2_score(wanted[15_000:, 1], twice[0][:, 1]) > 0.95
     assert (twice[0][:, 2] == 0).all()
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    again = [each(values[15_000:]) for each in fit([problem, problem])]
-    torch.set_num_threads(threads)
+    with torch_threads(2):
+        again = [each(values[15_000:]) for each in fit([problem, problem])]
     assert again[0].tobytes() == twice[0].tobytes()
     assert again[1].tobytes() == twice[1].tobytes() == twice[0].tobytes()  # as if each were alone
 

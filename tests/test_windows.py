@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensors import torch_threads
 from wide import wide
 
 from jbrep.dataset import Dataset, ScaledDataset
@@ -108,14 +109,11 @@ def test_forward_is_the_same_from_disk_stopped_and_on_more_threads(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(fit.checkpoint, "save", stopping)
-    fitter, threads = Fitter(data, tmp_path / "disk", memory=0), torch.get_num_threads()
+    fitter = Fitter(data, tmp_path / "disk", memory=0)
     with pytest.raises(KeyboardInterrupt):
         fitter.fit("forward", **how)
-    torch.set_num_threads(2)
-    try:
+    with torch_threads(2):
         resumed = fitter.fit("forward", **how)
-    finally:
-        torch.set_num_threads(threads)
     assert resumed.is_new
     assert resumed.path.read_bytes() == whole
     events = EventAccumulator(str(resumed.path.with_suffix(".training"))).Reload()

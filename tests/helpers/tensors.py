@@ -1,6 +1,18 @@
-"""Windows of rows that are there already, without a data set."""
+"""Windows of rows that are there already, without a data set; and torch's threads."""
+
+from contextlib import contextmanager
 
 import torch
+
+
+@contextmanager
+def torch_threads(count):
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class TensorWindows:
