@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command import jbrep
-from small import forge
+from small import assert_same_files, forge
 
 from jbrep.envs import describe
 from jbrep.errors import DamageError, InputError
@@ -98,8 +98,7 @@ def test_it_is_resumed_to_the_same_bits(source, later, tmp_path):
         train(run, tmp_path, Session(stop=iter([False] * 5 + [True]).__next__))
     assert load_untrained(tmp_path).task == CART
     train(run, tmp_path)
-    for name in (POLICY, BEGINNING, "evaluations.csv"):
-        assert (tmp_path / name).read_bytes() == (later / name).read_bytes()
+    assert_same_files(tmp_path, later, POLICY, BEGINNING, "evaluations.csv")
 
 
 def test_it_is_resumed_once_its_source_has_gone_on(source, tmp_path):

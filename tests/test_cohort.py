@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from small import assert_same_files
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.logger import Logger
 from torch.nn import functional
@@ -197,8 +198,8 @@ def together(given, folder, stop=lambda: False, save_every=1e9):
 def assert_same(folder, expected, seeds="012"):
     """What runs leave is the same, but for times."""
     for seed in seeds:
-        for name in ("policy.zip", "episodes.csv", "evaluations.csv"):
-            assert (folder / seed / name).read_bytes() == (expected / seed / name).read_bytes()
+        names = "policy.zip", "episodes.csv", "evaluations.csv"
+        assert_same_files(folder / seed, expected / seed, *names)
 
 
 SAC = {"algorithm": "sac", "overrides": {"learning_starts": 60}}

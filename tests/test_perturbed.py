@@ -3,11 +3,11 @@
 import json
 import tomllib
 
-import environments
 import mujoco
 import numpy as np
 import pytest
 from command import jbrep, mistake, refused
+from small import assert_same_files
 
 from jbrep.dataset import DataSettings
 from jbrep.envs import Lanes, describe
@@ -241,17 +241,6 @@ def test_factors_are_of_the_model_s_friction_and_masses():
         assert getattr(varied, name).tobytes() == getattr(usual, name).tobytes()
 
 
-def test_a_step_that_is_lost_is_not_seen():
-    assert environments
-    broken = describe("Sledges/Broken-v0", {"how": "nan", "seed": 5}, 30, missing="skip")
-    lanes = Lanes(with_domain(broken, {"noise": 0.1}), 1)
-    lanes.reset([0], [5])
-    while not lanes.lost.any():
-        before = lanes.observation
-        lanes.step(np.full((1, 3), 0.5))
-    np.testing.assert_array_equal(lanes.observation, before)
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
@@ -332,8 +321,7 @@ def runs(tmp_path_factory):
 
 def test_a_run_that_was_stopped_draws_on_by_either_trainer(runs):
     for trainer in ("cohort", "sb3"):
-        for name in (EPISODES, EVALUATIONS):
-            assert (runs / trainer / name).read_bytes() == (runs / "whole" / name).read_bytes()
+        assert_same_files(runs / trainer, runs / "whole", EPISODES, EVALUATIONS)
 
 
 def test_whoever_reads_a_run_knows_its_domain(runs):

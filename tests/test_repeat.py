@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from command import jbrep
-from small import settings
+from small import assert_same_files, settings
 
 from jbrep.collect import collect
 from jbrep.dataset import Dataset
@@ -126,8 +126,7 @@ def test_both_trainers_begin_alike(run, tmp_path_factory):
     chosen = record["settings"]["overrides"]
     counts = {n: record["settings"][n] for n in ("steps", "evaluate_every", "evaluation_episodes")}
     train(Run.of(TASK, "sac", "modern", chosen, final_episodes=3, trainer=other, **counts), there)
-    for name in (EPISODES, EVALUATIONS):
-        assert (there / name).read_bytes() == (run / name).read_bytes()
+    assert_same_files(there, run, EPISODES, EVALUATIONS)
 
 
 def test_whoever_plays_the_policy_holds_its_actions(run, tmp_path):

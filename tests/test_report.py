@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from command import mistake
 from made_up import write_record
-from small import adopt, forge
+from small import adopt, assert_same_files, forge
 
 from jbrep.encoders import find, save
 from jbrep.envs import describe
@@ -406,8 +406,7 @@ def test_it_can_be_made_from_the_tables_alone(whole, tmp_path):
     alone = tmp_path / "a-study"
     copy_tables(whole, alone)
     write_report(read_tables(alone), alone)
-    for name in (PAGE, SUMMARY, MARKDOWN, STATISTICS):
-        assert (alone / name).read_bytes() == (whole / name).read_bytes()
+    assert_same_files(alone, whole, PAGE, SUMMARY, MARKDOWN, STATISTICS)
     figures = [{f.name: f.read_bytes() for f in (d / FIGURES).iterdir()} for d in (alone, whole)]
     assert figures[0] == figures[1]
 

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from small import forge
+from small import assert_same_files, forge
 from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
@@ -59,8 +59,7 @@ def widths(network):
 
 
 def assert_same_run(one, other):
-    for name in ("episodes.csv", "evaluations.csv", "policy.zip", POLICY):
-        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+    assert_same_files(one, other, "episodes.csv", "evaluations.csv", "policy.zip", POLICY)
 
 
 @pytest.fixture(scope="module")
@@ -188,8 +187,7 @@ def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path)
     for name, every in (("often", 400), ("never", 10_000)):
         train(run.replace(evaluate_every=every), tmp_path / name)
     often, never = tmp_path / "often", tmp_path / "never"
-    for name in ("episodes.csv", "policy.zip"):
-        assert (often / name).read_bytes() == (never / name).read_bytes()
+    assert_same_files(often, never, "episodes.csv", "policy.zip")
     steps = [0, 400, 800, 880]
     assert sorted({e.step for e in read_evaluations(often)}) == steps
     rows = [line.split(",") for line in (often / "episodes.csv").read_text().splitlines()[1:]]

@@ -6,7 +6,7 @@ import cart
 import numpy as np
 import pytest
 from command import jbrep
-from small import ONE_EACH
+from small import ONE_EACH, assert_same_files
 
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
@@ -138,8 +138,7 @@ def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, tas
     lengths = container.read(other / CHECKPOINT, "checkpoint")[0]["lanes.lengths"]
     assert lengths.any()
     train(run, other)
-    for name in ("episodes.csv", "evaluations.csv", POLICY):
-        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+    assert_same_files(one, other, EPISODES, EVALUATIONS, POLICY)
 
 
 def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
@@ -233,11 +232,10 @@ def test_a_run_goes_on_as_one_that_had_more_steps_at_first(algorithm, overrides,
     grown, whole = tmp_path / "grown", tmp_path / "whole"
     train(shorter, grown, Session(keep_checkpoint=True))
     train(shorter, tmp_path / "short")
-    assert (grown / EVALUATIONS).read_bytes() == (tmp_path / "short" / EVALUATIONS).read_bytes()
+    assert_same_files(grown, tmp_path / "short", EVALUATIONS)
     train(longer, grown)
     train(longer, whole)
-    for name in (EPISODES, EVALUATIONS, POLICY, "policy.zip"):
-        assert (grown / name).read_bytes() == (whole / name).read_bytes(), name
+    assert_same_files(grown, whole, EPISODES, EVALUATIONS, POLICY, "policy.zip")
     with pytest.raises(InputError, match=r"can't go on: its checkpoint.safetensors is gone"):
         train(Run.of(CART, steps=400, **settings), grown)
     with pytest.raises(InputError, match=r"holds another run: steps 320 \(now: 160\)"):
@@ -272,8 +270,7 @@ def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(trainer, tmp_path, mon
     assert load_run(folder).settings.steps == 160
     for each in (folder, whole):
         assert jbrep(*settings, each, "--steps", 320).exit_code == 0
-    for name in (EPISODES, EVALUATIONS, POLICY):
-        assert (folder / name).read_bytes() == (whole / name).read_bytes(), name
+    assert_same_files(folder, whole, EPISODES, EVALUATIONS, POLICY)
 
 
 def test_a_run_that_was_stopped_can_go_on_with_more_steps(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command import jbrep, mistake
-from small import forge
+from small import assert_same_files, forge
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -296,9 +296,8 @@ def test_a_stopped_run_resumes_to_the_same_bytes_whatever_its_settings(
     run = Run.of(**QUICK, algorithm=algorithm, overrides=overrides, trainer=trainer)
     train(run, tmp_path / "whole")
     resumed(run, tmp_path / "stopped")
-    for name in ("episodes.csv", "evaluations.csv", POLICY):
-        whole, stopped = (tmp_path / each / name for each in ("whole", "stopped"))
-        assert whole.read_bytes() == stopped.read_bytes(), name
+    names = "episodes.csv", "evaluations.csv", POLICY
+    assert_same_files(tmp_path / "whole", tmp_path / "stopped", *names)
     there = sb3_class(algorithm).load(tmp_path / "whole" / POLICY_ZIP, device="cpu")
     assert getattr(there, "action_noise", None) is None  # whose class only jbrep has
     check_last_evaluation(tmp_path / "whole")

@@ -319,13 +319,6 @@ def test_a_fixed_policy_is_that_of_the_last_evaluation():
 # intervals
 
 
-def test_the_probability_of_improvement_is_mann_and_whitney_s():
-    random = np.random.default_rng(0)
-    x, y = random.normal(500, 30, 7), random.normal(480, 60, 12)
-    wins = stats.mannwhitneyu(x, y).statistic / (7 * 12)
-    assert probability_of_improvement(x, y) == pytest.approx(wins)
-
-
 def test_bonett_by_hand():
     """Kurtosis about the median for five runs: sums of squares 10 and 40, of fourths 34, 544."""
     x = np.arange(1.0, 6)

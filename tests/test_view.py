@@ -79,9 +79,10 @@ def test_a_lane_that_begins_anew_forgets():
     assert again[0, -1] == np.float32(0.5)
 
 
-def test_a_step_that_is_lost_is_not_seen():
-    broken = describe("Sledges/Broken-v0", {"how": "nan", "seed": 5}, 30, missing="skip")
-    lanes = Lanes(with_view(broken, history=3), 1)
+@pytest.mark.parametrize("change", [{"history": 3}, {"domain": {"noise": 0.1}}])
+def test_a_step_that_is_lost_is_not_seen(change):
+    broken = describe("Sledges/Broken-v0", {"how": "nan", "seed": 5}, 30, missing="skip", **change)
+    lanes = Lanes(broken, 1)
     lanes.reset([0], [5])
     while not lanes.lost.any():
         before = lanes.observation

@@ -29,6 +29,12 @@ def brief(task="face_direction", **changes):
     return settings(describe(task, max_episode_steps=100), **{"steps": 500, **changes})
 
 
+def assert_same_files(one, other, *names):
+    """Files of two folders have the same bytes."""
+    for name in names:
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+
+
 def write_again(source, folder):
     """Commit the shards of a data set to another folder, as a collector would."""
     manifest = read_manifest(source)
