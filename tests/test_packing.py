@@ -10,7 +10,7 @@ from jbrep.envs.instances import memory_of_each
 from jbrep.errors import InputError
 from jbrep.rl import Run, speed
 from jbrep.rl.cohort.replay import memory_of
-from jbrep.study import packing
+from jbrep.study import packing, plan
 from jbrep.study.config import Data, Study
 from jbrep.study.packing import packed, until_done, usual_workers
 from jbrep.study.plan import Plan
@@ -130,3 +130,11 @@ def test_robots_take_memory_beside_what_agents_remember(tmp_path, monkeypatch):
     packs = packs_of(tmp_path, 2, **cheetah, representations=("full",), seeds=tuple(range(20)))
     assert 1 <= max(map(len, packs)) <= 4
     assert memory_of_each(describe("face_direction")) == 0
+
+
+def test_robots_are_measured_once_however_often_a_study_is_packed(tmp_path, monkeypatch):
+    measured = []
+    monkeypatch.setattr(plan, "memory_of_each", lambda task: measured.append(task.name) or 0)
+    study = Plan(STUDY.replace(algorithms=("sac-modern",)), tmp_path)
+    assert packed(study, 2) == packed(study, 2)
+    assert measured == list(STUDY.tasks)

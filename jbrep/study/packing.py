@@ -2,15 +2,13 @@
 
 import heapq
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
 from jbrep.encoders import FULL
-from jbrep.envs.instances import memory_of_each
 from jbrep.envs.names import is_code
 from jbrep.errors import InputError
 from jbrep.machine import cores, memory
@@ -27,6 +25,7 @@ from jbrep.study.prepare import check
 from jbrep.study.representations import ByCode, ByName
 
 Pack = tuple[Cell, ...]
+_Groups = defaultdict[tuple[str, str, int], list[Cell]]  # by their kind, and what they observe
 
 # wider cohorts don't cost each of their agents less on a CPU
 _WIDEST = {CPU: 16, CUDA: 64}  # agents; for a GPU not measured yet
@@ -55,10 +54,20 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
     Raises:
         InputError: memory doesn't hold so many runs.
     """
-    groups, alone = defaultdict[tuple[str, str, int], list[Cell]](list), []
-    place, observed = {}, {}
-    for number, cell in enumerate(plan.unfinished):
-        place[cell.name] = number
+    unfinished = plan.unfinished
+    groups, alone = _grouped(plan, unfinished)
+    choices = range(_widest(plan, workers, width, groups, alone), 0, -1)
+    each = [alone + [p for group in groups.values() for p in _split(group, n)] for n in choices]
+    best = min(each, key=lambda packs: until_done([len(p) + _OVERHEAD for p in packs], workers))
+    place = {cell.name: number for number, cell in enumerate(unfinished)}
+    return sorted(best, key=lambda pack: (-len(pack), place[pack[0].name]))
+
+
+def _grouped(plan: Plan, cells: Iterable[Cell]) -> tuple[_Groups, list[Pack]]:
+    """The runs that can be in one pack with others, and those that can't, each by itself."""
+    groups, alone = _Groups(list), list[Pack]()
+    observed = dict[tuple[str, str], int]()  # by task and representation
+    for cell in cells:
         if trainer_of(cell.learner, plan.study) == COHORT:
             seen = cell.task, cell.representation.name
             if seen not in observed:
@@ -66,12 +75,22 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
             groups[*cell.kind, observed[seen]].append(cell)
         else:
             alone.append((cell,))
-    robot = cache(lambda task: memory_of_each(plan.task(task)))  # measured once for each task
-    widest, most_of = _WIDEST[plan.device], partial(_most, plan, workers, robot)
-    limits = (most_of(group[0], size) for (_, _, size), group in groups.items())
+    return groups, alone
+
+
+def _widest(
+    plan: Plan, workers: int, width: int | None, groups: _Groups, alone: Iterable[Pack]
+) -> int:
+    """The most runs that a pack may have, by memory and by what pays.
+
+    Raises:
+        InputError: as for `packed`.
+    """
+    widest = _WIDEST[plan.device]
+    limits = (_most(plan, workers, group[0], size) for (_, _, size), group in groups.items())
     most = min(limits, default=width or widest)
     of_alone = [
-        most_of(cell, _observed(plan, cell))
+        _most(plan, workers, cell, _observed(plan, cell))
         for cell in {cell.kind: cell for (cell,) in alone}.values()
         if is_off_policy(cell.learner.algorithm)
     ]
@@ -85,16 +104,13 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
             f"the width is {width}: {workers} cohorts of {most} agents are the most that this "
             "machine's memory holds"
         )
-    choices = range(width or min(widest, max(most, 1)), 0, -1)
-    each = [alone + [p for group in groups.values() for p in _split(group, n)] for n in choices]
-    best = min(each, key=lambda packs: until_done([len(p) + _OVERHEAD for p in packs], workers))
-    return sorted(best, key=lambda pack: (-len(pack), place[pack[0].name]))
+    return width or min(widest, max(most, 1))
 
 
-def _most(plan: Plan, workers: int, robot: Callable[[str], int], cell: Cell, observed: int) -> int:
-    """How many runs like this one memory holds, for each worker, where a robot takes so much."""
+def _most(plan: Plan, workers: int, cell: Cell, observed: int) -> int:
+    """How many runs like this one memory holds, for each worker."""
     run = plan.run(cell)
-    robots = run.learner.hyperparameters.num_envs * robot(cell.task)
+    robots = run.learner.hyperparameters.num_envs * plan.robot_memory(cell.task)
     of_each = memory_of(run, observed) + robots + _OF_AGENT
     return int((_SHARE * memory() / workers - _OF_WORKER) // of_each)
 

@@ -1,13 +1,14 @@
 """A study's folder: where its files are, and which runs it has."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import product
 from pathlib import Path
 
 from jbrep.envs.description import describe
+from jbrep.envs.instances import memory_of_each
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
 from jbrep.records.document import read_document
@@ -115,6 +116,11 @@ class Plan:
         """
         study = self.study
         return describe(name, study.environment, study.episode_steps, domain=study.domain or {})
+
+    @cached_property
+    def robot_memory(self) -> Callable[[str], int]:
+        """Bytes that each environment of a task takes, by the task's name; measured once."""
+        return cache(lambda name: memory_of_each(self.task(name)))
 
     def run(self, cell: Cell) -> Run:
         """What to train.
