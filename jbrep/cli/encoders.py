@@ -180,18 +180,7 @@ def list_shipped(task: str | None, as_json: bool) -> None:
     }
     if as_json:
         return echo_json(
-            {
-                name: [
-                    {
-                        "name": called,
-                        **{key: getattr(each, key) for key in ("kind", "size", "latent_size")},
-                        "sha256": each.fingerprint,
-                        "diagnostics": dict(known),
-                    }
-                    for called, each, known in encoders
-                ]
-                for name, encoders in listed.items()
-            }
+            {name: [_plain(*each) for each in encoders] for name, encoders in listed.items()}
         )
     width = terminal_width()
     for name, encoders in listed.items():
@@ -206,6 +195,18 @@ def list_shipped(task: str | None, as_json: bool) -> None:
     columns["error"] = "squared error of the reconstruction, as a multiple of PCA's"
     click.echo(f"columns\n{facts({'l': 'size of the code', **columns}, width)}\n")
     return click.echo(f"kinds of encoders\n{facts(words, width)}")
+
+
+def _plain(name: str, encoder: "Encoder", known: "Values") -> dict[str, Any]:
+    """An encoder that ships, as JSON has it."""
+    return {
+        "name": name,
+        "kind": encoder.kind,
+        "size": encoder.size,
+        "latent_size": encoder.latent_size,
+        "sha256": encoder.fingerprint,
+        "diagnostics": dict(known),
+    }
 
 
 def _with_diagnostics(task: "Task") -> "list[tuple[str, Encoder, Values]]":

@@ -97,7 +97,6 @@ def evaluate_policy(
     or late, readings are lost, the body or the physics is another, or the robot is pushed.
     """
     from jbrep.encoders.shipped import source_of
-    from jbrep.envs.infos import by_name, shares_text
     from jbrep.envs.names import import_code
     from jbrep.play.sources import is_by_name
 
@@ -112,33 +111,51 @@ def evaluate_policy(
         chosen = [each for each in perturbations if each]
         return _perturb(policy, player, chosen, (episodes, threads, retries), out, as_json)
     returns, numbers, failure = _outcome(player, episodes, threads, retries)
-    values = by_name(numbers)
-    if as_json:
-        echo_json(
-            {
-                "policy": policy,
-                "task": player.task.name,
-                "representation": player.representation,
-                **({} if source is None else {"encoder": source}),
-                **({} if player.step is None else {"step": player.step}),
-                "episodes": len(returns),
-                "returns": returns,
-                **percentiles(returns),
-                **({"infos": numbers} if values else {}),
-            }
-        )
-    else:
-        if source is not None:
-            say(f"encoder: {source}")
-        title = _title(policy, player)
-        played = counted(len(returns), "episode")
-        tell(f"{title}: median return {interval_of(returns)} (10-90 % of {played})")
-        if told := shares_text(values):
-            tell(told)
+    show = _echo_returns if as_json else _tell_returns
+    show(policy, player, source, returns, numbers)
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
         context.exit(1)
     return None
+
+
+def _echo_returns(
+    policy: str,
+    player: "Player",
+    source: str | None,
+    returns: list[float],
+    numbers: "list[Numbers]",
+) -> None:
+    echo_json(
+        {
+            "policy": policy,
+            "task": player.task.name,
+            "representation": player.representation,
+            **({} if source is None else {"encoder": source}),
+            **({} if player.step is None else {"step": player.step}),
+            "episodes": len(returns),
+            "returns": returns,
+            **percentiles(returns),
+            **({"infos": numbers} if any(numbers) else {}),
+        }
+    )
+
+
+def _tell_returns(
+    policy: str,
+    player: "Player",
+    source: str | None,
+    returns: list[float],
+    numbers: "list[Numbers]",
+) -> None:
+    from jbrep.envs.infos import by_name, shares_text
+
+    if source is not None:
+        say(f"encoder: {source}")
+    title, played = _title(policy, player), counted(len(returns), "episode")
+    tell(f"{title}: median return {interval_of(returns)} (10-90 % of {played})")
+    if told := shares_text(by_name(numbers)):
+        tell(told)
 
 
 def _check_perturbations(perturbations: tuple[str, ...], out: Path | None) -> None:
