@@ -111,51 +111,44 @@ def evaluate_policy(
         chosen = [each for each in perturbations if each]
         return _perturb(policy, player, chosen, (episodes, threads, retries), out, as_json)
     returns, numbers, failure = _outcome(player, episodes, threads, retries)
-    show = _echo_returns if as_json else _tell_returns
-    show(policy, player, source, returns, numbers)
+    _show_returns(policy, player, source, returns, numbers, as_json)
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
         context.exit(1)
     return None
 
 
-def _echo_returns(
+def _show_returns(
     policy: str,
     player: "Player",
     source: str | None,
     returns: list[float],
     numbers: "list[Numbers]",
-) -> None:
-    echo_json(
-        {
-            "policy": policy,
-            "task": player.task.name,
-            "representation": player.representation,
-            **({} if source is None else {"encoder": source}),
-            **({} if player.step is None else {"step": player.step}),
-            "episodes": len(returns),
-            "returns": returns,
-            **percentiles(returns),
-            **({"infos": numbers} if any(numbers) else {}),
-        }
-    )
-
-
-def _tell_returns(
-    policy: str,
-    player: "Player",
-    source: str | None,
-    returns: list[float],
-    numbers: "list[Numbers]",
+    as_json: bool,
 ) -> None:
     from jbrep.envs.infos import by_name, shares_text
 
+    if as_json:
+        return echo_json(
+            {
+                "policy": policy,
+                "task": player.task.name,
+                "representation": player.representation,
+                **({} if source is None else {"encoder": source}),
+                **({} if player.step is None else {"step": player.step}),
+                "episodes": len(returns),
+                "returns": returns,
+                **percentiles(returns),
+                **({"infos": numbers} if any(numbers) else {}),
+            }
+        )
     if source is not None:
         say(f"encoder: {source}")
     title, played = _title(policy, player), counted(len(returns), "episode")
     tell(f"{title}: median return {interval_of(returns)} (10-90 % of {played})")
     if told := shares_text(by_name(numbers)):
         tell(told)
+    return None
 
 
 def _check_perturbations(perturbations: tuple[str, ...], out: Path | None) -> None:

@@ -8,7 +8,7 @@ from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -132,18 +132,13 @@ def open_source(given: str, layout: Layout | None = None, missing: str = "") -> 
     name = _FILES[suffix] if is_file else next(folders, "minari")
     module = import_module(f"{__name__}.{name}")
     if hasattr(module, "open_table"):
-        return source_from(module.open_table(given), layout, missing)
+        from jbrep.dataset.formats.logs import source_of_table  # imports pyarrow
+
+        return source_of_table(module.open_table(given), layout, missing)
     if layout not in (None, Layout()):
         raise InputError(f"{given} names its arrays itself: only a table's columns can be named")
     opened: Source = module.open_source(given)
     return opened
-
-
-def source_from(table: Any, layout: Layout | None = None, missing: str = "") -> Source:
-    """A table as a source of episodes, see `jbrep.dataset.formats.logs.source_of_table`."""
-    from jbrep.dataset.formats.logs import source_of_table  # imports pyarrow
-
-    return source_of_table(table, layout, missing)
 
 
 def together(sources: Sequence[Source]) -> Source:
