@@ -1,4 +1,4 @@
-"""What the physics allows: planning on the true model, beside the hand-written policies.
+"""What the physics allows: planning on the true model, beside the policies that ship.
 
     python benchmarks/planning.py --episodes 10 --task move_to_pose
 
@@ -10,13 +10,16 @@ state and simulates the true physics, which no agent can: a reference, not a riv
 
 import argparse
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
+from jbrep.envs.description import as_task
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS, Array, JitterbugTask
+from jbrep.play.sources import find_player
 
 COPIES, HORIZON, HELD = 16, 80, 10  # robots; steps that they look ahead; steps until replanning
 TAIL, BEYOND = 20, 100  # the mean reward of the last steps counts for so many beyond the horizon
@@ -28,6 +31,7 @@ class Planned(NamedTuple):
 
     planned: float  # its return
     written: float  # that of the hand-written policy from the same start
+    trained: float  # that of the trained policy that ships
     seconds: float  # of CPU time, which planning took
     steps: int  # of robots that were simulated
 
@@ -68,7 +72,7 @@ class Planner:
 
 
 def plan(task: JitterbugTask, seed: int, copies: int, horizon: int, held: int) -> Planned:
-    """Play an episode by planning, and by the hand-written policy."""
+    """Play an episode by planning, and by both policies that ship."""
     began, robot = time.process_time(), Simulation(task, 1, 1)
     robot.reset([0], [np.random.default_rng(seed)])
     planner, planned = Planner(task, copies, horizon, seed), 0.0
@@ -76,12 +80,21 @@ def plan(task: JitterbugTask, seed: int, copies: int, horizon: int, held: int) -
         for drive in planner.drives(robot.state, held)[: EPISODE_STEPS - step]:
             robot.step(np.array([[drive]]))
             planned += float(robot.reward()[0])
-    seconds, written = time.process_time() - began, 0.0
+    seconds = time.process_time() - began
+    written = play(task, seed, HEURISTICS[task.name])
+    spec = as_task(task.name)
+    trained = play(task, seed, find_player("trained", spec).begin(spec, [seed]))
+    return Planned(planned, written, trained, seconds, planner.steps)
+
+
+def play(task: JitterbugTask, seed: int, act: Callable[[Array], Array]) -> float:
+    """What a policy returns from that start."""
+    robot, total = Simulation(task, 1, 1), 0.0
     robot.reset([0], [np.random.default_rng(seed)])
     for _ in range(EPISODE_STEPS):
-        robot.step(HEURISTICS[task.name](robot.observe()))
-        written += float(robot.reward()[0])
-    return Planned(planned, written, seconds, planner.steps)
+        robot.step(act(robot.observe()))
+        total += float(robot.reward()[0])
+    return total
 
 
 def main() -> None:
@@ -99,17 +112,19 @@ def main() -> None:
         f"returns of {given.episodes} episodes, median [least, most]; {given.copies} copies look "
         f"{given.horizon} steps ahead every {given.held} steps\n"
     )
-    print("| task | planned | hand-written | CPU minutes an episode | robot-steps a step |")
-    print("|---|---|---|---|---|")
+    print(
+        "| task | planned | hand-written | trained | CPU minutes an episode | robot-steps a step |"
+    )
+    print("|---|---|---|---|---|---|")
     for name in given.task:
         each = [
             plan(TASKS[name], seed, given.copies, given.horizon, given.held)
             for seed in range(given.episodes)
         ]
         columns = np.array(each).T
-        cells = [f"{np.median(c):.0f} [{c.min():.0f}, {c.max():.0f}]" for c in columns[:2]]
-        minutes, cost = columns[2].mean() / 60, columns[3].mean() / EPISODE_STEPS
-        print(f"| {name} | {cells[0]} | {cells[1]} | {minutes:.1f} | {cost:.0f} |", flush=True)
+        cells = [f"{np.median(c):.0f} [{c.min():.0f}, {c.max():.0f}]" for c in columns[:3]]
+        minutes, cost = columns[3].mean() / 60, columns[4].mean() / EPISODE_STEPS
+        print(f"| {name} | {' | '.join(cells)} | {minutes:.1f} | {cost:.0f} |", flush=True)
 
 
 if __name__ == "__main__":
