@@ -4,7 +4,8 @@
 # What a robot has logged becomes a data set, the data set a code of the state, the code what an
 # agent observes, and the agent one file that runs on the robot. This is a notebook: editors open
 # it by its marks, `jupytext --to ipynb notebook.py` makes it one for Jupyter, and `python
-# notebook.py` runs it through in some minutes, in its own folder.
+# notebook.py` runs it through in some minutes, in a folder that must be new. It needs
+# `pip install '.[dm-control,learn,logs,export]'`.
 
 # %%
 from pathlib import Path

@@ -1,6 +1,7 @@
 """Everything that one can bring: an encoder, data, and the policy of a run to collect with.
 
-python examples/own/own.py OUT walks through it on the Jitterbug and on Pendulum, in a minute.
+python examples/own/own.py OUT walks through it on the Jitterbug and on Pendulum, in a minute, where
+`make setup` has installed everything: it needs the extras and onnxscript.
 """
 
 import csv

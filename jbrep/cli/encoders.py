@@ -52,7 +52,7 @@ _KEPT = "the same command resumes agents"
 )
 @click.option(
     "--policy",
-    help="That does the task well: a run's folder, or a policy by name. By default the task's "
+    help="A policy that does the task well: a run's folder, or a policy by name. By default the task's "
     "hand-written policy, if it has one.",
 )
 @click.option(
@@ -148,7 +148,7 @@ def _notes(
     return notes
 
 
-@click.group()
+@click.group(epilog="Example: jbrep encoder list")
 def encoder() -> None:
     """Look at encoders, export and import them."""
 

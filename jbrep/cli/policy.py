@@ -19,7 +19,7 @@ from jbrep.errors import InputError
 from jbrep.text import interval_of, returns_text
 
 
-@click.group()
+@click.group(epilog="Example: jbrep policy export runs/a --out controller.onnx")
 def policy() -> None:
     """Export a trained policy for a robot, and check the file."""
 
@@ -71,7 +71,7 @@ def export(policy: str, task: str | None, form: str, out: Path) -> None:
 
 @policy.command(epilog="Example: jbrep policy check controller.onnx --run runs/a")
 @click.argument("model", type=PATH)
-@click.option("--run", help="That it was taken from, or trained, to play beside it.")
+@click.option("--run", help="The run that it was exported from, or trained, to play beside it.")
 @click.option("--episodes", default=20, show_default=True, type=POSITIVE, help="How many.")
 @threads_option
 @retries_option

@@ -177,7 +177,7 @@ def _left(folder: Path) -> str:
 )
 @needed_task_option
 @learner_options
-@click.option("--trials", default=20, show_default=True, type=POSITIVE, help="In all.")
+@click.option("--trials", default=20, show_default=True, type=POSITIVE, help="Trials in all.")
 @click.option("--seeds", default=1, show_default=True, type=POSITIVE, help="Runs of each trial.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of the search and runs.")
 @record_options(

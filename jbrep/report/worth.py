@@ -71,8 +71,8 @@ def advice(evaluation: Evaluation, found: Ranked) -> str:
     if len(found.best) == 1:
         return f"Take {smallest}: {_BY}, it is worth the most."
     return (
-        f"Take {smallest}: {_BY}, the smallest of those not clearly worse than the best, "
-        f"{enumerated(found.best)}."
+        f"Take {smallest}: {_BY}, the smallest of those not clearly worse than the best. "
+        f"These are {enumerated(found.best)}."
     )
 
 

@@ -81,7 +81,7 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
         Meta(
             ge=0,
             le=MAX_EPISODES,
-            description="Of the last time.",
+            description="Episodes of the last evaluation, after training.",
             extra={"default": "ten times as many"},
         ),
     ] = 0
@@ -102,7 +102,7 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
     ] = "float32"
     device: Annotated[
         Literal["cpu", "cuda", "auto"],
-        Meta(description="That a cohort learns on; auto is cuda where there is one."),
+        Meta(description="Where a cohort takes its gradient steps; auto is cuda where there is one."),
     ] = "cpu"
 
     def check(self) -> None:
