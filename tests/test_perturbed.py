@@ -3,10 +3,12 @@
 import json
 import tomllib
 
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
 from command import jbrep, mistake, refused
+from gymnasium.envs.registration import EnvSpec
 from small import assert_same_files
 
 from jbrep.dataset import DataSettings
@@ -239,6 +241,46 @@ def test_factors_are_of_the_model_s_friction_and_masses():
     put_factors(varied, usual, 1, 1, data)
     for name in ("body_mass", "body_inertia", "dof_invweight0", "geom_friction"):
         assert getattr(varied, name).tobytes() == getattr(usual, name).tobytes()
+
+
+class Loaded(gymnasium.Env):
+    """A robot that draws its own mass in each episode, which is its reward."""
+
+    action_space = observation_space = gymnasium.spaces.Box(-1, 1)
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(LEGGED)
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.model.body_mass[1] = self.np_random.uniform(0.5, 3)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), self.model.body_mass[1], False, False, {}
+
+
+def test_what_an_environment_draws_itself_stays_drawn(monkeypatch):
+    """Two lanes, of which one plays a second episode; a factor is on top of it."""
+    spec = EnvSpec("Loaded-v0", Loaded, max_episode_steps=9)
+    monkeypatch.setitem(gymnasium.registry, "Loaded-v0", spec)
+
+    def masses(**domain):
+        lanes, still = Lanes(describe("Loaded-v0", domain=domain), 2), np.zeros((2, 1))
+        lanes.reset([0, 1], [1, 2])
+        first = lanes.step(still).reward
+        lanes.reset([0], [3])
+        legs = [lane.unwrapped.model.body_mass[2] for lane in lanes.envs]
+        second = lanes.step(still).reward
+        lanes.close()
+        return np.array([*first, *second, *legs])
+
+    drawn = masses()
+    assert len({*drawn}) == 4  # of three episodes, and of the legs
+    np.testing.assert_array_equal(masses(push=0.5), drawn)
+    np.testing.assert_array_equal(masses(friction=0.5), drawn)
+    np.testing.assert_allclose(masses(mass=2), 2 * drawn)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,8 @@ from jbrep.envs.domain import Domain, Draws
 from jbrep.envs.mujoco import physics_of, root_of
 from jbrep.envs.task import Array
 
+_VARIED = "geom_friction", "pair_friction", "body_mass", "body_inertia"
+
 
 def put_factors(
     model: mujoco.MjModel, usual: mujoco.MjModel, friction: float, mass: float, data: mujoco.MjData
@@ -69,6 +71,8 @@ def can_be_pushed(model: mujoco.MjModel) -> bool:
 class Varied(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment with MuJoCo, whose friction, masses and pushes each episode draws.
 
+    Frictions and masses that the environment itself sets in its reset are multiplied likewise.
+
     Args:
         env: the environment.
         domain: from which it draws.
@@ -89,9 +93,17 @@ class Varied(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._speed[:] = drawn.push
         self._draws.begin(np.array([0]), np.array([seed]))
         self._vary(drawn.friction, drawn.mass)
+        put = {name: getattr(self._model, name).copy() for name in _VARIED}
         given = self.env.reset(seed=seed, options=options)
+        self._keep(put)
         self._vary(drawn.friction, drawn.mass)  # it may have another model now
         return given
+
+    def _keep(self, put: dict[str, Array]) -> None:
+        """Take the numbers that the environment changed since they were put there as the usual."""
+        for name, before in put.items():
+            now, usual = getattr(self._model, name), getattr(self._usual, name)
+            usual[:] = np.where(now == before, usual, now)
 
     def _vary(self, friction: float, mass: float) -> None:
         physics = physics_of(self.env)
