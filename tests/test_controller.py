@@ -189,6 +189,9 @@ def test_what_it_cannot_act_on_is_refused():
     controller = controller_of(randomised("td3", "full"))
     with pytest.raises(InputError, match=f"takes observations of {TASK.size} numbers, but got"):
         controller([0.0])
+    one_array = rf"is a dict: the policy takes {TASK.size} numbers in one array, as gymnasium\.spac"
+    with pytest.raises(InputError, match=one_array):
+        controller({"position": np.zeros(TASK.size)})
     with pytest.raises(InputError, match="the policy's action is not finite"):
         controller(np.full(TASK.size, np.nan))
     assert controller(np.zeros(TASK.size)).shape == (TASK.action_size,)  # there is none to hold

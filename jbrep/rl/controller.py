@@ -136,10 +136,19 @@ class Controller:
         history keeps it: give what the robot shows now.
 
         Raises:
-            InputError: observations of another size; or the action isn't finite, as where an
-                observation isn't.
+            InputError: observations of another size, or that aren't one array; or the action isn't
+                finite, as where an observation isn't.
         """
-        self._held = self._act(self._seen(np.asarray(observation, np.float32)))
+        try:
+            rows = np.asarray(observation, np.float32)
+        except (TypeError, ValueError):
+            shown = len(self.task.view.places) if self.task.view else self.task.size
+            raise InputError(
+                f"the observation is a {type(observation).__name__}: the policy takes {shown} "
+                "numbers in one array, as gymnasium.spaces.flatten(env.observation_space, "
+                "observation) gives them"
+            ) from None
+        self._held = self._act(self._seen(rows))
         return self._held.copy()
 
     def _seen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
