@@ -409,7 +409,7 @@ def test_missing_readings_are_held_or_end_an_episode_and_counted(tmp_path):
     command = ("collect", *robot, "--steps", 30, "--threads", 1, "--out", tmp_path / "d")
     told = jbrep(*command)
     assert told.exit_code == 2
-    assert "gave an observation or reward that is not finite, at step 4" in told.output
+    assert "gave an observation or reward that is not finite in 32 bits, at step 4" in told.output
     assert "--missing" in told.output
     told = jbrep(*command[:-1], tmp_path / "held", "--missing", "hold:2")
     assert told.exit_code == 0, told.output
@@ -423,7 +423,7 @@ def test_missing_readings_are_held_or_end_an_episode_and_counted(tmp_path):
     assert held.episodes["missing"].tolist() == [6, 6]
     assert jbrep("data", "verify", tmp_path / "held", "--replay", 2).exit_code == 0
     told = jbrep(*command[:-1], tmp_path / "x", "--missing", "hold:1")
-    assert (told.exit_code, "not finite, at step 5" in told.output) == (2, True)
+    assert (told.exit_code, "not finite in 32 bits, at step 5" in told.output) == (2, True)
     told = jbrep(*command[:-1], tmp_path / "cut", "--missing", "skip")
     assert told.exit_code == 0, told.output
     cut = Dataset(tmp_path / "cut")

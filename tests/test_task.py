@@ -1,12 +1,14 @@
 """Tasks: what is found out of an environment, what is refused, and what a stranger may write."""
 
 import json
+from functools import partial
 
 import environments
 import gymnasium
 import numpy as np
 import pytest
-from command import jbrep
+from command import jbrep, refused
+from gymnasium.envs.registration import EnvSpec
 
 from jbrep.cli.environment import parse_arguments
 from jbrep.dataset.schema import episode_seed
@@ -162,6 +164,75 @@ def test_what_can_t_be_a_task_is_said_in_one_line(name, arguments, message):
     with pytest.raises(InputError, match=message) as refusal:
         describe(name, arguments)
     assert "\n" not in str(refusal.value)
+
+
+class Sledging(environments.Sledge):
+    """A sledge that ends, and tells, as its arguments say.
+
+    Args:
+        lasts: steps after which episodes are truncated, by their seeds.
+        lost: where along the rail an episode is truncated.
+        fails: in the step with this number.
+        numbers: of an observation.
+        shape: of an action.
+    """
+
+    dt = np.float32(0.25)
+
+    def __init__(self, lasts=(99999,), lost=1e9, fails=None, numbers=2, shape=(1,)):
+        super().__init__(rail=np.inf)
+        self.lasts, self.lost, self.fails, self.numbers = lasts, lost, fails, numbers
+        self.action_space = gymnasium.spaces.Box(-0.1, 0.1, shape)
+
+    def reset(self, *, seed=None, options=None):
+        given = super().reset(seed=seed)
+        self.length = self.lasts[seed % len(self.lasts)]
+        return given
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.steps += 1
+        assert self.steps != self.fails, "the rail broke"
+        self.state += 0.1 * action.sum()
+        is_over = self.steps == self.length or bool(abs(self.state[0]) > self.lost)
+        return self.observe(), 0.0, False, is_over, {}
+
+    def observe(self):
+        return np.resize(self.state, self.numbers)
+
+
+@pytest.fixture
+def sledging(monkeypatch):
+    """Describes one that is registered without a time limit."""
+    monkeypatch.setitem(gymnasium.registry, "Sledging-v0", EnvSpec("Sledging-v0", Sledging))
+    return lambda limit=None, **arguments: describe("Sledging-v0", arguments, limit)
+
+
+def test_a_time_limit_is_the_same_in_each_episode(sledging):
+    task = sledging(lasts=[350])
+    assert (task.max_episode_steps, task.timestep) == (350, 0.25)
+    differs = "it truncated an episode after {} steps, and another lasted at least {}: give one"
+    for lasts in ([250, 350], [350, 250], [20, 150]):
+        told = refused(partial(sledging, lasts=lasts))
+        assert differs.format(min(lasts), max(lasts)) in told
+    assert "at least 10,000: give one with" in refused(partial(sledging, lost=0.25))
+    failed = "no time limit within 299 steps, where it failed: AssertionError: the rail broke: give"
+    assert failed in refused(partial(sledging, fails=300))
+    assert sledging(250, fails=300).max_episode_steps == 250
+    assert "failed when it was tried: AssertionError" in refused(partial(sledging, fails=30))
+
+
+def test_an_action_may_be_one_number_alone(sledging):
+    task = sledging(9, shape=())
+    assert task.action_size == 1
+    lanes = Lanes(task, 1)
+    lanes.reset([0], [0])
+    assert lanes.step([[0.1]]).observation.any()
+
+
+def test_observations_must_fit_their_space(sledging):
+    said = "failed when it was tried: ValueError: it gave an observation of 3 numbers instead of 2"
+    assert said in refused(partial(sledging, 9, numbers=3))
 
 
 @pytest.mark.parametrize("steps", [0, -1, 1_000_001])

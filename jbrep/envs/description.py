@@ -16,7 +16,8 @@ from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from jbrep.envs import instances
-from jbrep.envs.make import aside, creator, random_play, reason
+from jbrep.envs.infos import number_of
+from jbrep.envs.make import action_in, aside, creator, random_play, reason
 from jbrep.envs.mujoco import with_kinds
 from jbrep.envs.names import find_spec
 from jbrep.envs.origin import absolute, code_of, files_of
@@ -152,8 +153,9 @@ def _described(
     features = list(features_of(env_id, env.observation_space))
     spec = find_spec(env_id)
     episodes = [_play(env, seed) for seed in (0, 1, 0)]
-    limit = max_episode_steps or spec.max_episode_steps or _find_limit(env, env_id)
-    timestep: Any = getattr(env.unwrapped, "dt", None)
+    limit = max_episode_steps or spec.max_episode_steps
+    limit = limit or _find_limit(env, env_id, (each.length for each in episodes))
+    timestep = number_of(getattr(env.unwrapped, "dt", None))
     task = Task(
         id=env_id,
         name=env_id,
@@ -162,7 +164,7 @@ def _described(
         action_high=tuple(_bounds(action)[1].tolist()),
         max_episode_steps=limit,
         arguments=dict(arguments),
-        timestep=float(timestep) if _is_positive(timestep) else None,
+        timestep=timestep if timestep and timestep > 0 else None,
         solved_return=spec.reward_threshold,
         terminates=True if any(each.terminated for each in episodes) else None,
         reproducible=episodes[0].content == episodes[2].content,
@@ -261,26 +263,66 @@ def _is_image(space: spaces.Space[Any]) -> bool:
     )
 
 
-def _find_limit(env: gymnasium.Env[Any, Any], env_id: str) -> int:
-    """The time limit that an environment keeps by itself."""
-    space: Any = env.action_space
-    for episode in range(6):
-        random = np.random.default_rng(episode)
-        share = episode % 2  # of random action: one that stands still may last longer
-        env.reset(seed=episode)
-        for step in range(1, _LONGEST_PROBE + 1):
-            action = (space.low + space.high) / 2
-            action = action + share * (random.uniform(space.low, space.high) - action)
-            _, _, terminated, truncated, _ = env.step(action.astype(space.dtype))
-            if truncated:
-                return step
-            if terminated:
-                break
+def _find_limit(env: gymnasium.Env[Any, Any], env_id: str, lengths: Iterable["_Length"]) -> int:
+    """The time limit that an environment keeps by itself, as several episodes show it.
+
+    Args:
+        env: is played.
+        env_id: for messages.
+        lengths: of the episodes with the seeds 0 and 1, as far as they were played.
+
+    Raises:
+        InputError: no episode is truncated, or another one lasts longer.
+    """
+    known = [*lengths]
+    for seed in range(2, 8):  # others than those of the lengths
+        share = seed % 2  # of random action: one that stands still may last longer
+        known.append(_length(env, env_id, seed, share))
+        limit = min((each.steps for each in known if each.truncated), default=None)
+        longest = max(each.steps for each in known)
+        if limit and longest > limit:
+            raise InputError(
+                f"{env_id} has no time limit: it truncated an episode after {limit:,} steps, and "
+                f"another lasted at least {longest:,}: give one with --episode-steps"
+            )
+        if limit and share:
+            return limit
     raise InputError(f"{env_id} has no time limit: give one with --episode-steps")
 
 
-def _is_positive(value: Any) -> bool:
-    return isinstance(value, (int, float)) and math.isfinite(value) and value > 0
+class _Length(NamedTuple):
+    """How long an episode was played."""
+
+    steps: int
+    truncated: bool  # after them
+
+
+def _length(env: gymnasium.Env[Any, Any], env_id: str, seed: int, share: float) -> _Length:
+    """How long an episode is, played for at most `_LONGEST_PROBE` steps.
+
+    Args:
+        env: is played.
+        env_id: for messages.
+        seed: of the episode.
+        share: of random actions; the rest is the middle between the bounds.
+    """
+    space: Any = env.action_space
+    random, middle = np.random.default_rng(seed), (space.low + space.high) / 2
+    env.reset(seed=seed)
+    for step in range(1, _LONGEST_PROBE + 1):
+        action = middle + share * (random.uniform(space.low, space.high) - middle)
+        try:
+            _, _, terminated, truncated, _ = env.step(action_in(space, action))
+        except Exception as error:
+            if step <= _PROBE_STEPS:
+                raise  # it fails whatever the limit
+            raise InputError(
+                f"{env_id} has no time limit within {step - 1:,} steps, where it failed: "
+                f"{reason(error)}: give one with --episode-steps"
+            ) from error
+        if terminated or truncated:
+            break
+    return _Length(step, bool(truncated))
 
 
 def _seed_bits(env: gymnasium.Env[Any, Any]) -> SeedBits:
@@ -298,13 +340,15 @@ class _Played(NamedTuple):
     content: list[bytes]  # of each state, every bit
     observations: NDArray[np.float64]  # (n, d)
     terminated: bool  # by a state
+    length: _Length
 
 
 def _play(env: gymnasium.Env[Any, Any], seed: int) -> _Played:
     steps = [*random_play(env, seed, _PROBE_STEPS)]
     content = [flat.tobytes() + np.array(told).tobytes() for flat, *told in steps]
     observations = np.array([each.observation for each in steps], np.float64)
-    return _Played(content, observations, steps[-1].terminated)
+    *_, terminated, truncated = steps[-1]
+    return _Played(content, observations, terminated, _Length(len(steps) - 1, truncated))
 
 
 class _FeatureChanges(Record, frozen=True):

@@ -104,6 +104,22 @@ def flattener(space: spaces.Space[Any]) -> Flatten:
     return lambda given: np.asarray(flatten(space, given))
 
 
+def action_in(space: Any, values: Any) -> NDArray[Any]:
+    """An action in a space, a Box: a new array of its shape and type, of numbers (k,)."""
+    return np.array(values, space.dtype).reshape(space.shape)
+
+
+def of_size(flat: NDArray[Any], size: int) -> NDArray[Any]:
+    """An observation, flat, that has so many numbers.
+
+    Raises:
+        ValueError: it has more or fewer.
+    """
+    if flat.shape != (size,):
+        raise ValueError(f"it gave an observation of {flat.size} numbers instead of {size}")
+    return flat
+
+
 class Step(NamedTuple):
     """What an environment gives."""
 
@@ -114,18 +130,23 @@ class Step(NamedTuple):
 
 
 def random_play(env: gymnasium.Env[Any, Any], seed: int, most: int) -> Iterator[Step]:
-    """The first observation of an episode, and up to so many steps under random actions."""
+    """The first observation of an episode, and up to so many steps under random actions.
+
+    Raises:
+        ValueError: what it gives doesn't fit its spaces.
+    """
     random, flat = np.random.default_rng(seed), flattener(env.observation_space)
     space: Any = env.action_space
+    size = spaces.utils.flatdim(env.observation_space)
     observation, info = env.reset(seed=seed)
     if not isinstance(info, Mapping):
         raise ValueError("too many values to unpack (expected 2")  # old Gym's
-    yield Step(np.array(flat(observation)), 0.0, False, False)
+    yield Step(of_size(np.array(flat(observation)), size), 0.0, False, False)
     for _ in range(most):
-        action = random.uniform(space.low, space.high).astype(space.dtype)
+        action = action_in(space, random.uniform(space.low, space.high))
         observation, reward, terminated, truncated, _ = env.step(action)
         ends = bool(number(terminated, "terminated")), bool(number(truncated, "truncated"))
-        yield Step(np.array(flat(observation)), number(reward, "reward"), *ends)
+        yield Step(of_size(np.array(flat(observation)), size), number(reward, "reward"), *ends)
         if any(ends):
             break
 

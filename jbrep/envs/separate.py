@@ -1,6 +1,5 @@
 """An environment for each lane, used like a batch: simulations of any kind, and real robots."""
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -11,13 +10,14 @@ from numpy.typing import NDArray
 
 from jbrep.envs import instances
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
-from jbrep.envs.make import aside, flattener, number, reason
+from jbrep.envs.make import aside, flattener, number, of_size, reason
 from jbrep.envs.task import Array, Task, most_held
 from jbrep.errors import InputError, Notice
 
 Flags = NDArray[np.bool_]
 State = dict[str, NDArray[Any]]
 _Actions = list[NDArray[np.float32]]
+_LARGEST = float(np.finfo(np.float32).max)  # that data sets and agents can have
 _NOW, _BEFORE = "", "before_"  # begin the names of what a state has of each lane's episodes
 
 
@@ -199,14 +199,10 @@ class Separate:
         reward: float = 0.0,
         after_step: bool = False,
     ) -> None:
-        flat = self._flat(observation)
-        if flat.shape != (self._task.size,):
-            raise ValueError(
-                f"it gave an observation of {flat.size} numbers instead of {self._task.size}"
-            )
+        flat = of_size(self._flat(observation), self._task.size)
         if self._offset is not None:
             flat = flat - self._offset
-        if math.isfinite(flat.sum() + reward):
+        if float(np.abs(flat).sum()) + abs(reward) <= _LARGEST:
             self._held[lane] = 0
         else:
             flat, reward = self._without_missing(lane, flat, reward, after_step)
@@ -223,9 +219,9 @@ class Separate:
         self, lane: int, flat: Array, reward: float, after_step: bool
     ) -> tuple[Array, float]:
         """An observation and a reward in which the last ones stand for those that are missing."""
-        missing, is_missing = ~np.isfinite(flat), not math.isfinite(reward)
+        missing, is_missing = ~(np.abs(flat) <= _LARGEST), not abs(reward) <= _LARGEST
         if not missing.any() and not is_missing:
-            return flat, reward  # their sum overflows
+            return flat, reward  # their sum is larger
         self.missing[lane] += missing.sum() + is_missing
         self._held[lane] += 1
         if self._task.missing == "skip" and len(self._episodes[lane].actions) > 1:
@@ -233,8 +229,9 @@ class Separate:
         if not after_step or self._held[lane] > most_held(self._task.missing or ""):
             raise EnvironmentFailedError(
                 f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
-                f"reward that is not finite, at step {len(self._episodes[lane].actions)} of the "
-                f"episode with seed {self._episodes[lane].seed}; {self._missing_said}",
+                "reward that is not finite in 32 bits, at step "
+                f"{len(self._episodes[lane].actions)} of the episode with seed "
+                f"{self._episodes[lane].seed}; {self._missing_said}",
                 lane,
             )
         filled = np.where(missing, self._observation[lane], flat)

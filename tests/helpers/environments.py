@@ -52,7 +52,7 @@ class Broken(Sledge):
     """A sledge that breaks at step 4 of an episode.
 
     Args:
-        how: "raises", "nan", "reward" or "size".
+        how: "raises", "nan", "huge", "reward" or "size".
         seed: of the episode.
     """
 
@@ -65,9 +65,8 @@ class Broken(Sledge):
         if (self.seed, self.steps) == (self.breaking, 4):
             if self.how == "raises":
                 raise RuntimeError("the rail broke\nin two")
-            observation = {"nan": observation * np.nan, "size": np.zeros(3)}.get(
-                self.how, observation
-            )
+            spoilt = {"nan": observation * np.nan, "huge": [1e39, -1e39], "size": np.zeros(3)}
+            observation = spoilt.get(self.how, observation)
             reward = np.inf if self.how == "reward" else reward
         return observation, reward, *others
 
