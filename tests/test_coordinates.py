@@ -3,23 +3,27 @@
 from collections import Counter
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 import torch
+from command import jbrep, mistake
 from gymnasium.envs.registration import EnvSpec
 
+from jbrep.collect import collect
 from jbrep.coordinates import INGREDIENTS, Coordinates, make_coordinates
 from jbrep.coordinates.coordinates import Part
 from jbrep.coordinates.formulas import FORMULAS
 from jbrep.coordinates.invariance import check_invariant
 from jbrep.coordinates.nearest import continuous, nearest
 from jbrep.coordinates.placing import placed
+from jbrep.dataset import DataSettings
 from jbrep.encoders import find
 from jbrep.envs.description import describe
 from jbrep.envs.mujoco import turned_quaternion
 from jbrep.envs.task import Feature
 from jbrep.envs.view import with_view
-from jbrep.errors import InputError
+from jbrep.errors import InputError, Notice
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.records.record import from_plain, to_plain
@@ -381,6 +385,131 @@ def test_symmetry_is_tried_on_what_encoders_take(monkeypatch):
     shifted = make_coordinates(task.replace(offsets={"goal_x": 3.0}), "symmetry")
     with pytest.raises(InputError, match="use coordinates in place of symmetry"):
         check_invariant(shifted)
+
+
+BOT = """<body name="bot" pos="0 0 .2"><freejoint/><geom type="box" size=".2 .1 .1"/>
+<site name="s"/></body>"""
+PUCK = '<body pos="2 2 .1"><freejoint/><geom size=".1" mass=".1"/></body>'
+PLANAR = """<body {}><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>
+<joint axis="0 0 1"/><geom size=".1"/><site name="s"/></body>"""
+WINCH = '<body><joint axis="0 0 1" range="{}"/><geom size=".1"/><site name="s"/></body>'
+
+
+class Made(gymnasium.Env):
+    """Bodies that MuJoCo moves, and a thruster; the whole state is seen.
+
+    Args:
+        bodies: in MuJoCo's XML.
+        far: ends an episode; where along x the robot mustn't be.
+        reward: of each step, None for its speed.
+        fails: in the step with this number.
+        shape: of an action.
+    """
+
+    def __init__(self, bodies=BOT, far=9, reward=None, fails=None, shape=(1,)):
+        self.model = mujoco.MjModel.from_xml_string(
+            f'<mujoco><worldbody><geom type="plane" size="9 9 .1"/>{bodies}</worldbody>'
+            '<actuator><motor site="s" gear="1 0 0 0 0 1"/></actuator></mujoco>'
+        )
+        self.data = mujoco.MjData(self.model)
+        self.far, self.reward, self.fails = far, reward, fails
+        self.action_space = gymnasium.spaces.Box(-1, 1, shape)
+        size = self.model.nq + self.model.nv
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qvel[:] = self.np_random.uniform(-0.3, 0.3, self.model.nv)
+        return self._seen(), {}
+
+    def step(self, action):
+        print("moving")
+        self.steps += 1
+        assert self.action_space.contains(action)
+        assert self.steps != self.fails, "the motor is stuck"
+        self.data.ctrl = action.flat
+        mujoco.mj_step(self.model, self.data, 5)
+        speed = float(np.linalg.norm(self.data.qvel[:2]))
+        is_far = bool(abs(self.data.qpos[0]) > self.far)
+        return self._seen(), speed if self.reward is None else self.reward, is_far, False, {}
+
+    def _seen(self):
+        return np.concatenate((self.data.qpos, self.data.qvel))
+
+
+def made(monkeypatch, **arguments):
+    """The task of such bodies."""
+    spec = EnvSpec("Made-v0", Made, max_episode_steps=60)
+    monkeypatch.setitem(gymnasium.registry, "Made-v0", spec)
+    return describe("Made-v0", arguments)
+
+
+def kinds(task):
+    return [each.kind for each in task.features]
+
+
+def test_the_robot_is_the_heaviest_of_free_bodies(monkeypatch):
+    free, other = ["point"] * 3 + ["quaternion"] * 4, ["scalar"] * 7
+    assert kinds(made(monkeypatch, bodies=PUCK + BOT))[:14] == other + free
+    task = made(monkeypatch, bodies=BOT + PUCK)
+    assert kinds(task)[:14] == free + other
+    with pytest.raises(InputError, match="its robot isn't the only free body of MuJoCo's"):
+        check_invariant(make_coordinates(task, "symmetry"))
+
+
+@pytest.mark.parametrize(
+    ("body", "first"),
+    [
+        (PLANAR.format(""), ["point", "point", "angle"]),
+        (PLANAR.format('euler="90 0 0"'), ["scalar", "scalar", "angle"]),  # in a vertical plane
+        (WINCH.format("-180 180"), ["angle", "scalar"]),
+        (WINCH.format("-1080 1080"), ["scalar", "scalar"]),
+    ],
+)
+def test_what_joints_mean_depends_on_how_they_stand_and_how_far_they_go(body, first, monkeypatch):
+    assert kinds(made(monkeypatch, bodies=body))[: len(first)] == first
+
+
+def test_where_episodes_end_is_tried(monkeypatch):
+    ended = "the end of the episode is 0 without a quarter turn and 1 after one"
+    with pytest.raises(InputError, match=ended):
+        check_invariant(make_coordinates(made(monkeypatch, far=0.4), "symmetry"))
+
+
+def test_rewards_that_are_all_the_same_tell_nothing_of_symmetry(monkeypatch):
+    task = made(monkeypatch, reward=0.0)
+    with pytest.warns(Notice, match="gave the reward 0 at every step at which symmetry was tried"):
+        check_invariant(make_coordinates(task, "symmetry"))
+
+
+def test_what_fails_while_symmetry_is_tried_is_said_in_one_line(monkeypatch, capsys):
+    """An action has the shape of its space, and what is printed is no output."""
+    task = made(monkeypatch, shape=(1, 1))
+    check_invariant(make_coordinates(task, "symmetry"))
+    fails = task.replace(arguments={**task.arguments, "fails": 3})
+    with pytest.raises(InputError, match="can't be tried on Made-v0: AssertionError: the motor is"):
+        check_invariant(make_coordinates(fails, "symmetry"))
+    assert not capsys.readouterr().out
+
+
+def test_an_encoder_of_symmetry_needs_the_module_that_makes_its_robot(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    settings = DataSettings(task=made(monkeypatch), steps=150)
+    collect(settings, tmp_path / "data", num_threads=1)
+    monkeypatch.delitem(gymnasium.registry, "Made-v0")
+    (tmp_path / "its_robot.py").write_text(
+        "import gymnasium, test_coordinates\n"
+        "gymnasium.register('Made-v0', test_coordinates.Made, max_episode_steps=60)"
+    )
+    where = ("--data", tmp_path / "data", "--out", tmp_path / "encoders")
+    make = ("train-encoder", "--kind", "symmetry", *where)
+    assert "add the one that registers it, as --import MODULE" in mistake(*make)
+    assert jbrep(*make, "--import", "its_robot").exit_code == 0
+    for command in (("train-dae", "--latent", 2), ("evaluate", "--encoder", "full")):
+        assert "can't import none" in mistake(*command, *where, "--import", "none")
 
 
 def test_a_task_whose_features_say_nothing():

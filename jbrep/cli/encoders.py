@@ -11,6 +11,7 @@ from jbrep.cli.completion import complete_encoder, complete_task
 from jbrep.cli.environment import (
     environment_options,
     given_task,
+    import_option,
     needed_task,
     needed_task_option,
     task_option,
@@ -73,6 +74,7 @@ _KEPT = "the same command resumes agents"
     is_flag=True,
     help="Show errors, probes and units, too; evaluation.json always has them.",
 )
+@import_option
 @as_json
 def evaluate(
     encoder: tuple[str, ...],

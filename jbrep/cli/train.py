@@ -11,6 +11,7 @@ from msgspec import inspect
 
 from jbrep.cli.base import PATH, POSITIVE, RESUMES, Variadic, data_option, with_options
 from jbrep.cli.completion import complete_kind
+from jbrep.cli.environment import import_option
 from jbrep.cli.output import tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError, choose
@@ -156,6 +157,7 @@ _making = with_options(
         help="Make N of each, of the seeds 0 to N - 1: NAME-s0, NAME-s1, ...",
     ),
     click.option("--preset", help="Named settings; of dae: authors, its authors' own."),
+    import_option,
 )
 
 

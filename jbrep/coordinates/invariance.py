@@ -1,5 +1,6 @@
 """Whether a task is the same wherever its robot stands and however it is turned: tried out."""
 
+import warnings
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
@@ -9,11 +10,12 @@ from gymnasium.spaces.utils import flatten
 
 from jbrep.coordinates.coordinates import Coordinates
 from jbrep.coordinates.made import Ingredient, System, make_coordinates
-from jbrep.envs.make import make_env
+from jbrep.envs.make import action_in, aside, make_env, reason
 from jbrep.envs.mujoco import quarter_turn
+from jbrep.envs.names import spec_of
 from jbrep.envs.task import Array, Task
 from jbrep.envs.view import Window
-from jbrep.errors import InputError
+from jbrep.errors import InputError, Notice, refusing
 
 _SEEDS, _BEFORE, _AFTER = 3, 10, 5  # episodes; steps before the turn and after it
 _SAME = 1e-5  # relative difference of rewards and coordinates, as float32 rounds them
@@ -38,41 +40,55 @@ def check_invariant(coordinates: Coordinates) -> None:
     """Make sure that turning and shifting the robot changes neither coordinates nor rewards.
 
     Two robots are played alike; then one of them is turned by a quarter and, if the task has points
-    in the world, shifted, with the targets that the environment moves along.
+    in the world, shifted, with the targets that the environment moves along. Their episodes must
+    end alike, too. Where all rewards were the same, a notice says that they tell nothing.
 
     Raises:
         InputError: they change, or it can't be tried.
     """
     task = coordinates.task
-    envs: list[gymnasium.Env[Any, Any]] = []
-    names, seen = (*coordinates.names, "the reward"), []
-    try:
-        for _ in range(2):
-            envs.append(make_env(task.id, task.arguments, task.max_episode_steps))
-        for seed in range(_SEEDS):
-            for observations, rewards in _played(envs, task, seed):
-                seen.append(np.column_stack((coordinates.forward(observations), rewards)))
-    finally:
-        for env in envs:
-            env.close()
-    if not seen:
+    with refusing(f"symmetry can't be tried on {task.name}", told=reason), aside():
+        steps = _tried(task)
+    if not steps:
         raise InputError(
             f"symmetry can't be tried on {task.name}: its episodes under random actions end within "
             f"{_BEFORE} steps; use coordinates"
         )
-    both = np.array(seen)  # (steps, 2, numbers)
+    names = (*coordinates.names, "the reward")
+    both = np.array([np.column_stack((coordinates.forward(o), r)) for o, r in steps])
     sizes = np.abs(both).max(axis=(0, 1))
     sizes[:-1] = np.maximum(sizes[:-1], 1)  # a reward may be in any unit
     apart = np.abs(both[:, 0] - both[:, 1]) / np.where(sizes, sizes, 1)
     wrong = np.flatnonzero(apart.max(axis=1) > _SAME)
     if len(wrong):
         worst = apart[wrong[0]].argmax()
-        as_it_is, turned = both[wrong[0], :, worst]
-        raise InputError(
-            f"{task.name} isn't the same for a turned robot: {names[worst]} is {as_it_is:.4g} "
-            f"without a quarter turn and {turned:.4g} after one; use coordinates in place of "
-            "symmetry"
+        raise _not_the_same(task, names[worst], *both[wrong[0], :, worst])
+    if not np.ptp(both[..., -1]):
+        warnings.warn(
+            f"{task.name} gave the reward {both[0, 0, -1]:.4g} at every step at which symmetry was "
+            "tried: if its rewards depend on where the robot is in the world, use coordinates",
+            Notice,
+            stacklevel=2,
         )
+
+
+def _not_the_same(task: Task, what: str, as_it_is: float, turned: float) -> InputError:
+    return InputError(
+        f"{task.name} isn't the same for a turned robot: {what} is {as_it_is:.4g} without a "
+        f"quarter turn and {turned:.4g} after one; use coordinates in place of symmetry"
+    )
+
+
+def _tried(task: Task) -> list[tuple[Array, Array]]:
+    """The steps of some episodes, see `_played`."""
+    envs: list[gymnasium.Env[Any, Any]] = []
+    try:
+        for _ in range(2):
+            envs.append(make_env(spec_of(task).id, task.arguments, task.max_episode_steps))
+        return [step for seed in range(_SEEDS) for step in _played(envs, task, seed)]
+    finally:
+        for env in envs:
+            env.close()
 
 
 def _played(
@@ -89,17 +105,20 @@ def _played(
     for step in range(turned + _AFTER):
         if step == _BEFORE and not quarter_turn(envs[1], shift):
             raise InputError(
-                f"symmetry can't be tried on {task.name}: its robot isn't a free body of MuJoCo's, "
-                "and its environment has no quarter_turn; use coordinates"
+                f"symmetry can't be tried on {task.name}: its robot isn't the only free body of "
+                "MuJoCo's, and its environment has no quarter_turn; use coordinates"
             )
         action = random.uniform(task.action_low, task.action_high).astype(np.float32)
-        moved = [env.step(action) for env in envs]
+        moved = [env.step(action_in(env.action_space, action)) for env in envs]
+        ends = [bool(each[2] or each[3]) for each in moved]
+        if ends[0] != ends[1]:
+            raise _not_the_same(task, "the end of the episode", *ends)
         seen = _flat(envs, [each[0] for each in moved]) - task.whole.offset
         if window:
             seen = window.step(np.ones(len(envs), bool), np.stack([action] * len(envs)), seen)
         if step >= turned - 1:
             yield seen, np.array([each[1] for each in moved], np.float64)
-        if any(each[2] or each[3] for each in moved):
+        if any(ends):
             return
 
 

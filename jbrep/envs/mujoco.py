@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 _EPISODES, _STEPS = 3, 40  # that are played to see which feature is which quantity
 _SAME = 1e-6  # relative difference, of observations in float32
+_TURN = 2 * np.pi + 1e-3  # [rad], as models round it
 
 
 class Physics(NamedTuple):
@@ -77,19 +78,18 @@ def with_kinds(env: gymnasium.Env[Any, Any], features: Sequence[Feature]) -> tup
 
 def _quantities(model: mujoco.MjModel) -> Iterator[tuple[int, _Quantity]]:
     """Numbers of the state, qpos and then qvel, that aren't scalars, by their places."""
-    free = mujoco.mjtJoint.mjJNT_FREE
-    freed = [joint for joint in range(model.njnt) if model.jnt_type[joint] == free]
+    free = _free_joints(model)
     for joint in range(model.njnt):
         name, place = f"joint{joint}", int(model.jnt_qposadr[joint])
         speed = model.nq + int(model.jnt_dofadr[joint])
-        if joint in freed[:1]:
+        if joint in free[:1]:
             yield from _row(place, "point", "world", "m", f"{name}.position", 3)
             yield from _row(place + 3, "quaternion", "", "1", f"{name}.attitude", 4)
             yield from _row(speed, "vector", "world", "m/s", f"{name}.velocity", 3)
             yield from _row(speed + 3, "vector", "body", "rad/s", f"{name}.angular_velocity", 3)
-        elif model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+        elif _is_angle(model, joint):
             yield place, _Quantity("angle", "", "rad", "", 0)
-    if not freed and (root := _planar_root(model)):
+    if not free and (root := _planar_root(model)):
         x, y, turn = root
         for axis, joint in enumerate((x, y)):
             yield (
@@ -103,6 +103,18 @@ def _quantities(model: mujoco.MjModel) -> Iterator[tuple[int, _Quantity]]:
         yield int(model.jnt_qposadr[turn]), _Quantity("angle", "world", "rad", "", 0)
 
 
+def _free_joints(model: mujoco.MjModel) -> list[int]:
+    """The joints of free bodies, first the robot's, which is the heaviest tree."""
+    free, root = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE), root_of(model)
+    return sorted(free.tolist(), key=lambda joint: bool(model.jnt_bodyid[joint] != root))
+
+
+def _is_angle(model: mujoco.MjModel, joint: int) -> bool:
+    """Whether a joint is a hinge on which a turn more is the same place."""
+    several = model.jnt_limited[joint] and np.ptp(model.jnt_range[joint]) > _TURN
+    return model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and not several
+
+
 def _row(
     place: int, kind: Kind, frame: Frame, unit: str, whole: str, count: int
 ) -> Iterator[tuple[int, _Quantity]]:
@@ -112,9 +124,12 @@ def _row(
 
 def _planar_root(model: mujoco.MjModel) -> tuple[int, int, int] | None:
     """The joints by which a body moves along the world's x and y and turns about z."""
-    for body in range(1, model.nbody):
+    root, along_the_world = root_of(model), (1, 0, 0, 0)
+    for body in sorted(range(1, model.nbody), key=lambda body: body != root):
         first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
         if model.body_parentid[body] or count < 3:
+            continue
+        if not np.array_equal(model.body_quat[body], along_the_world):
             continue
         kinds = model.jnt_type[first : first + 3].tolist()
         slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
@@ -193,7 +208,7 @@ def quarter_turn(env: gymnasium.Env[Any, Any], shift: tuple[float, float]) -> bo
     MuJoCo's pyramidal friction cones are the same along both axes only.
 
     Returns:
-        Whether it could be done: only a free body, or one that moves in the plane.
+        Whether it could be done: only where one body is free, or one moves in the plane.
     """
     if own := getattr(env.unwrapped, "quarter_turn", None):
         own(shift)
@@ -202,8 +217,10 @@ def quarter_turn(env: gymnasium.Env[Any, Any], shift: tuple[float, float]) -> bo
     if physics is None:
         return False
     model, data = physics
-    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    if len(free):
+    free = _free_joints(model)
+    if len(free) > 1:
+        return False  # whether the others belong to the robot isn't known
+    if free:
         place, speed = int(model.jnt_qposadr[free[0]]), int(model.jnt_dofadr[free[0]])
         quaternion = data.qpos[place + 3 : place + 7]
         quaternion[:] = turned_quaternion(quaternion)
