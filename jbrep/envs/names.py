@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module, metadata
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,7 +16,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
 from jbrep.envs.task import SHORT_NAMES, Task
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import InputError, kind_and_line, refusing
 
 _CODE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", re.ASCII)
 _imported: list[str] = []
@@ -133,18 +134,14 @@ def code_named(name: str, what: str) -> Any:
         InputError: its module wasn't imported on request, or has no such name.
     """
     module, _, path = name.partition(":")
-    thing: Any = imported(module)
+    thing = imported(module)
     if thing is None:
         raise InputError(
             f"the {what} {name} is code: importing {module} runs it; if you trust it, add "
             f"--import {module}"
         )
-    try:
-        for part in path.split("."):
-            thing = getattr(thing, part)
-    except AttributeError as error:
-        raise InputError(f"can't make the {what} {name}: {kind_and_line(error)}") from None
-    return thing
+    with refusing(f"can't make the {what} {name}", (AttributeError,)):
+        return attrgetter(path)(thing)
 
 
 def name_given(text: str) -> str:

@@ -65,10 +65,8 @@ def exported_player(path: Path, task: Task | None = None) -> Player:
     check_same(known, said.environment, str(path))
 
     def act(observation: Array) -> NDArray[Any]:
-        try:
+        with refusing(f"{path} can't be run", told=first_line):
             (action,) = session.run([made.name], {given.name: observation.astype("float32")})
-        except Exception as error:  # of several classes
-            raise InputError(f"{path} can't be run: {first_line(error)}") from None
         return action
 
     def begin(task: Task, seeds: Any) -> Actor:

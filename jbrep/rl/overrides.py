@@ -15,7 +15,7 @@ from msgspec import Meta
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from jbrep.errors import InputError
+from jbrep.errors import InputError, refusing
 from jbrep.records.record import converted, shown, to_plain
 from jbrep.rl.agent import ACTIVATIONS, Spaces, global_random_state_kept, make_agent, one_line
 from jbrep.rl.presets import (
@@ -262,12 +262,8 @@ def _check_together(algorithm: str, chosen: Hyperparameters) -> None:
 def _build(algorithm: str, chosen: Hyperparameters) -> None:
     """Build an agent, so that what stable-baselines3 refuses is known before the first step."""
     small = without_buffer(algorithm, chosen)
-    try:
-        with warnings.catch_warnings(), global_random_state_kept():
-            warnings.simplefilter("ignore")  # training gives them
-            env = DummyVecEnv([lambda: Spaces(*_ANY_SPACES)] * chosen.num_envs)
-            make_agent(algorithm, small, env, 0)
-    except Exception as error:  # stable-baselines3's own checks raise many types
-        raise InputError(
-            f"stable-baselines3 can't make {algorithm} with these settings: {one_line(error)}"
-        ) from None
+    what = f"stable-baselines3 can't make {algorithm} with these settings"
+    with refusing(what, told=one_line), warnings.catch_warnings(), global_random_state_kept():
+        warnings.simplefilter("ignore")  # training gives them
+        env = DummyVecEnv([lambda: Spaces(*_ANY_SPACES)] * chosen.num_envs)
+        make_agent(algorithm, small, env, 0)

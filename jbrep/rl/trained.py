@@ -14,7 +14,7 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.vec_env import agent_spaces
 from jbrep.envs.recording import Actor, held
 from jbrep.envs.task import Array, Task
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import DamageError, InputError, refusing
 from jbrep.records import container
 from jbrep.records.container import Tensors, without
 from jbrep.rl.agent import (
@@ -108,10 +108,9 @@ def fill(policy: BasePolicy, weights: Tensors, path: Path) -> None:
         InputError: they don't fit the policy.
         DamageError: a weight that the policy acts by is not finite.
     """
-    try:
+    errors = (AttributeError, RuntimeError, TypeError, ValueError)
+    with refusing(f"{path} doesn't fit the run's settings", errors, told=one_line):
         policy.load_state_dict({name: torch.tensor(values) for name, values in weights.items()})
-    except (AttributeError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(f"{path} doesn't fit the run's settings: {one_line(error)}") from None
     if not all(bool(torch.isfinite(part).all()) for part in acting(policy).parameters()):
         raise DamageError(f"{path} is damaged: the policy's weights are not finite")
 
@@ -128,14 +127,11 @@ def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
     encoder.check_task(task)
     shape = check_shape(settings.algorithm, settings.hyperparameters)
     small = without_buffer(settings.algorithm, shape)
-    try:
-        with global_random_state_kept():
-            spaces = Spaces(*agent_spaces(task, encoder))
-            agent = make_agent(settings.algorithm, small, spaces, settings.seed)
-    except (AssertionError, KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"no policy can be made from the settings of the run: {one_line(error)}"
-        ) from None
+    what = "no policy can be made from the settings of the run"
+    errors = (AssertionError, KeyError, TypeError, ValueError)
+    with refusing(what, errors, told=one_line), global_random_state_kept():
+        spaces = Spaces(*agent_spaces(task, encoder))
+        agent = make_agent(settings.algorithm, small, spaces, settings.seed)
     statistics = Statistics.untrained(encoder.latent_size) if shape.normalize else None
     repeat = settings.hyperparameters.action_repeat
     return Trained(agent.policy, task, encoder, settings, None, statistics, repeat)

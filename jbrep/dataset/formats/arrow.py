@@ -8,7 +8,7 @@ import pyarrow as pa
 from jbrep.dataset.formats.episodes import label
 from jbrep.dataset.formats.flat import CHUNK
 from jbrep.dataset.formats.tables import Table, with_widths
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import refusing
 
 
 def table_of(frame: Any, name: str) -> Table:
@@ -17,11 +17,9 @@ def table_of(frame: Any, name: str) -> Table:
     Raises:
         InputError: it is something else.
     """
-    try:
+    with refusing(f"{name} isn't a table", (TypeError, ValueError, pa.ArrowException)):
         columns = dict(frame) if isinstance(frame, Mapping) else frame
         table = pa.table(columns).combine_chunks()
-    except (TypeError, ValueError, pa.ArrowException) as error:
-        raise InputError(f"{name} isn't a table: {kind_and_line(error)}") from None
 
     def batches(names: list[str]) -> Iterator[pa.RecordBatch]:
         yield from table.select(names).to_batches(CHUNK)

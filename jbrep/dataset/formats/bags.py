@@ -19,7 +19,7 @@ from jbrep.dataset.formats.flat import CHUNK
 from jbrep.dataset.formats.tables import Table
 from jbrep.dataset.layout import Layout
 from jbrep.envs.task import MAX_FEATURES
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import refusing
 from jbrep.records.record import MOST_WHOLE
 
 _TIME = "time"
@@ -70,14 +70,10 @@ def open_table(given: str) -> Table:
 @contextmanager
 def _opened(path: Path) -> Iterator[AnyReader]:
     """A reader of a bag; types that the bag doesn't define are those of ROS 2."""
-    try:
+    with refusing(f"{path} can't be read as a bag"):  # whatever damaged bags raise
         store = get_typestore(Stores.ROS2_HUMBLE)
         with AnyReader([path], default_typestore=store) as reader:
             yield reader
-    except InputError:
-        raise
-    except Exception as error:  # whatever damaged bags raise
-        raise InputError(f"{path} can't be read as a bag: {kind_and_line(error)}") from None
 
 
 def _messages(reader: AnyReader, topics: set[str]) -> Iterator[_Message]:

@@ -26,7 +26,7 @@ from jbrep.dataset.formats.flat import CHUNK, own_names
 from jbrep.dataset.formats.tables import NAMES, Table, width
 from jbrep.dataset.layout import Layout
 from jbrep.envs.task import MAX_FEATURES
-from jbrep.errors import InputError, kind_and_line, listed
+from jbrep.errors import InputError, listed, refusing
 from jbrep.text import counted
 
 Array = NDArray[Any]
@@ -50,15 +50,10 @@ def opened(path: Path, *, whole: bool = False) -> Iterator[h5py.File]:
         InputError: it is damaged, also if that shows while it is read; or it has links, or arrays
             that take much more memory than the file has bytes.
     """
-    try:
-        with h5py.File(path) as file:
-            if problem := file.visititems_links(partial(_problem, file, whole)):
-                raise InputError(f"{path}: {problem}")
-            yield file
-    except InputError:
-        raise
-    except Exception as error:  # whatever HDF5 raises at damaged files
-        raise InputError(f"{path} can't be read as an HDF5 file: {kind_and_line(error)}") from None
+    with refusing(f"{path} can't be read as an HDF5 file"), h5py.File(path) as file:
+        if problem := file.visititems_links(partial(_problem, file, whole)):
+            raise InputError(f"{path}: {problem}")
+        yield file
 
 
 def _problem(file: h5py.File, whole: bool, name: str, link: Any) -> str | None:

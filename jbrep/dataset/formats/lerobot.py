@@ -19,7 +19,7 @@ from jbrep.dataset.formats.tables import NAMES, Table, width, with_offsets, with
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import InputError, refusing
 from jbrep.progress import Progress
 from jbrep.records.storage import (
     inside,
@@ -93,18 +93,14 @@ def open_table(given: str) -> Table:
 def _info(path: Path) -> dict[str, Any]:
     """What the data set says of itself, as far as it is used."""
     raw = read_regular(path, _MAX_BYTES)
-    try:
+    errors = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
+    with refusing(f"{path} isn't as LeRobot writes it", errors):
         info = json.loads(raw)
         version, fps = str(info["codebase_version"]), float(info["fps"])
         frames = int(info["total_frames"]) if "total_frames" in info else None
         known = {str(name): dict(each) for name, each in info["features"].items()}
         known = {name: each | {"dtype": str(each["dtype"])} for name, each in known.items()}
         offsets = np.array(info.get(_OFFSETS, 0.0), np.float64)
-    except (
-        *(ValueError, KeyError, TypeError),
-        *(AttributeError, OverflowError, RecursionError),
-    ) as error:
-        raise InputError(f"{path} isn't as LeRobot writes it: {kind_and_line(error)}") from None
     if not version.startswith(_VERSIONS):
         raise InputError(f"{path} is of LeRobot's layout {version}: it must be v3.0 or v2.1")
     if not 0 < fps < np.inf:

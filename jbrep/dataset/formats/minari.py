@@ -36,7 +36,7 @@ from jbrep.dataset.schema import UNKNOWN_SEED, DataSettings
 from jbrep.envs.description import describe, features_of
 from jbrep.envs.names import spec_of
 from jbrep.envs.task import Task
-from jbrep.errors import DamageError, InputError, kind_and_line, listed
+from jbrep.errors import DamageError, InputError, kind_and_line, listed, refusing
 from jbrep.progress import Progress
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Finite, Sha256
@@ -174,11 +174,9 @@ def _metadata(folder: Path) -> dict[str, Any]:
     """
     path = folder / _METADATA
     raw = read_regular(path, _MAX_BYTES)
-    try:
+    with refusing(f"{path} can't be read", (ValueError, KeyError, TypeError, RecursionError)):
         metadata = json.loads(raw)
         spaces_of = [metadata["observation_space"], metadata["action_space"]]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{path} can't be read: {kind_and_line(error)}") from None
     if not all(isinstance(space, str) for space in spaces_of):
         raise InputError(f"{path} doesn't say what observations and actions are")
     return dict(metadata)

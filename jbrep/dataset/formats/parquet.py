@@ -8,7 +8,7 @@ import io
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from jbrep.dataset.formats.flat import CHUNK, per_episode
 from jbrep.dataset.formats.tables import Table, with_offsets, with_widths
 from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import MAX_FEATURES, Task
-from jbrep.errors import DamageError, InputError, first_line
+from jbrep.errors import DamageError, InputError, first_line, refusing
 from jbrep.progress import Progress
 from jbrep.records.document import Document, document_in
 from jbrep.records.record import Sha256, from_plain
@@ -82,16 +82,10 @@ def open_table(given: str) -> Table:
     )
 
 
-@contextmanager
-def reading(path: Path) -> Iterator[None]:
+def reading(path: Path) -> AbstractContextManager[None]:
     """Say of a file that it can't be read."""
-    try:
-        yield
-    except InputError:
-        raise
-    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
-        reason = first_line(error)
-        raise InputError(f"{path} can't be read as a Parquet file: {reason}") from None
+    errors = (OSError, KeyError, TypeError, ValueError, pa.ArrowException)
+    return refusing(f"{path} can't be read as a Parquet file", errors, told=first_line)
 
 
 def check_sizes(name: str, metadata: pq.FileMetaData, schema: pa.Schema) -> None:
