@@ -10,7 +10,7 @@ from jbrep.stats.bootstrap import Array
 from jbrep.stats.curves import Compared, compared, final_return, steps_to
 from jbrep.stats.intervals import Bounds, surely_above
 from jbrep.stats.runs import Group, RunCurve, evaluated_run, with_failure_returns
-from jbrep.stats.scale import reference_in_training, reference_of
+from jbrep.stats.scale import references
 
 FEWEST_UNITS = 8  # units on either side of a verdict
 _HALF = 0.5  # of the baseline's gain: what a run that learns comes to
@@ -87,8 +87,8 @@ def learns(arm: Arm, frame: Frame) -> bool:
 def _frame(group: Mapping[str, list[RunCurve]], known: Compared) -> Frame:
     first = evaluated_run(group)
     grid, curves, finals = known.grid, known.of_baseline, known.finals
-    of_baseline, over = next(iter(finals.values())), reference_in_training(first, curves)
-    reference = reference_of(first, curves) if known.on_all_starts else over
+    of_baseline = next(iter(finals.values()))
+    reference, over = references(known, first)
     gain = max(float(of_baseline.mean()) - reference, 0.0)
     gain_in_training = max(float(final_return(curves, grid).mean()) - over, 0.0)
     widths = np.diff(grid)

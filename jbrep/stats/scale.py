@@ -23,7 +23,7 @@ class Scale(NamedTuple):
     """What all representations of a task and algorithm are measured by."""
 
     grid: Array  # training steps at which runs are compared, (g,)
-    reference: float  # the return that gains are counted over, as `reference_of` has it
+    reference: float  # the final return that gains are counted over, by `references`
     # the mean return of the best policy that doesn't look, with its interval, else the reference
     blind: Interval
     # the return to reach for each of STEPS_TO, NaN where there is none
@@ -39,24 +39,18 @@ def best_blind(returns: Mapping[str, float]) -> str | None:
     return max(blind, key=returns.__getitem__) if blind else None
 
 
-def reference_of(run: RunCurve, curves: Array) -> float:
-    """The return that gains are counted over, on all starts of the last evaluation.
+def references(compared: Compared, run: RunCurve) -> tuple[float, float]:
+    """The returns that gains are counted over: those of final returns, and those of curves.
 
-    That is the run's own reference where it is known, else the least possible return of the task.
-    Where neither is known, it is that of untrained policies on the starts of the curves: the mean
-    at the first step of the baseline's on the grid, (runs, g).
+    Either is from the same starts as what is held against it; those of the evaluations during
+    training may be fewer than those of the last. It is the run's own reference where it is known,
+    else the least possible return of the task. Where neither is known, it is that of untrained
+    policies: the mean of the baseline's curves at their first step.
     """
     known = (each for each in (run.reference, run.return_floor) if each is not None)
-    return float(next(known, curves[:, 0].mean()))
-
-
-def reference_in_training(run: RunCurve, curves: Array) -> float:
-    """The same on the starts of the evaluations during training, which may be fewer.
-
-    What is read off curves is held against returns from the same starts.
-    """
-    known = run.reference_in_training
-    return reference_of(run, curves) if known is None else known
+    last = float(next(known, compared.of_baseline[:, 0].mean()))
+    training = last if run.reference_in_training is None else run.reference_in_training
+    return last if compared.on_all_starts else training, training
 
 
 def scale_of(compared: Compared, run: RunCurve, policies: Mapping[str, Interval]) -> Scale:
@@ -69,13 +63,12 @@ def scale_of(compared: Compared, run: RunCurve, policies: Mapping[str, Interval]
             the final returns.
     """
     grid, curves, finals = compared.grid, compared.of_baseline, [*compared.finals.values()]
-    over, solved = reference_in_training(run, curves), run.solved
-    reference = reference_of(run, curves) if compared.on_all_starts else over
+    reference, over = references(compared, run)
     best = best_blind({name: float(each.value) for name, each in policies.items()})
     gained = surely_above(finals[0], reference, run.bounds)
     gain = float(np.median(final_return(curves, grid))) - over
     shares = [over + share * gain if gained and gain > 0 else np.nan for share in SHARES.values()]
-    thresholds = (*shares, np.nan if solved is None else float(solved))
+    thresholds = (*shares, np.nan if run.solved is None else float(run.solved))
     return Scale(
         grid=grid,
         reference=reference,
