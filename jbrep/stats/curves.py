@@ -103,7 +103,7 @@ def final_return(curves: Array, grid: Array) -> Array:
     return curves[:, grid >= end - _LAST * (end - start)].mean(axis=1)
 
 
-def end_on_all_starts(group: Mapping[str, Sequence[RunCurve]], grid: Array) -> bool:
+def _end_on_all_starts(group: Mapping[str, Sequence[RunCurve]], grid: Array) -> bool:
     """Whether final returns can be those of an evaluation of more episodes.
 
     All runs that didn't fail end with one on the grid, and the return that gains are counted over
@@ -116,24 +116,8 @@ def end_on_all_starts(group: Mapping[str, Sequence[RunCurve]], grid: Array) -> b
     return bool(whole) and is_known and ends
 
 
-def final_returns(
-    group: Mapping[str, Sequence[RunCurve]], curves: Mapping[str, Array], grid: Array
-) -> dict[str, Array]:
-    """The final return of each run of each representation, (runs,) each, from curves (runs, g).
-
-    It is the mean of the last evaluation if all `end_on_all_starts`, else that of the evaluations
-    in the last tenth of the grid. A run that failed ends with its failure_return.
-    """
-    if not end_on_all_starts(group, grid):
-        return {name: final_return(each, grid) for name, each in curves.items()}
-    finals = {}
-    for name, runs in group.items():
-        pairs = zip(runs, curves[name], strict=True)
-        finals[name] = np.array([_end(run, curve) for run, curve in pairs])
-    return finals
-
-
 def _end(run: RunCurve, curve: Array) -> float:
+    """The mean of a run's last evaluation; its failure_return if it failed."""
     if run.failed_at is not None and run.failure_return is not None:
         return run.failure_return
     return float(curve[-1] if run.final is None else run.final.mean())
@@ -147,7 +131,8 @@ class Compared(NamedTuple):
     # of each representation's runs on the grid, (runs, g), the baseline first
     curves: dict[str, Array]
     finals: dict[str, Array]  # the final return of each of these runs, (runs,)
-    on_all_starts: bool  # whether that is of the starts of the last evaluation, not of the curves'
+    # whether that is the mean of the last evaluation, of its starts, or by `final_return`
+    on_all_starts: bool
 
     @property
     def of_baseline(self) -> Array:
@@ -163,8 +148,11 @@ def compared(group: Group) -> Compared:
     """
     grid, cut = common_grid(group)
     curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in group.items()}
-    on_all_starts = end_on_all_starts(group, grid)
-    return Compared(grid, cut, curves, final_returns(group, curves, grid), on_all_starts)
+    if on_all_starts := _end_on_all_starts(group, grid):
+        finals = {n: np.array([*map(_end, runs, curves[n])]) for n, runs in group.items()}
+    else:
+        finals = {n: final_return(each, grid) for n, each in curves.items()}
+    return Compared(grid, cut, curves, finals, on_all_starts)
 
 
 def mean_return(curves: Array, grid: Array) -> Array:
