@@ -64,12 +64,11 @@ def load_zip(
     Raises:
         InputError: it isn't trusted, is no such file, or fits neither task nor encoder.
     """
-    for file in filter(None, (path, vecnormalize)):
-        if not trust:
-            raise InputError(
-                f"{file} is not in a folder of jbrep rl: stable-baselines3 files hold pickled "
-                "Python, which runs as code when it is read; add --trust if you know who made it"
-            )
+    if not trust:
+        raise InputError(
+            f"{path} is not in a folder of jbrep rl: stable-baselines3 files hold pickled Python, "
+            "which runs as code when it is read; add --trust if you know who made it"
+        )
     raw = read_file(path.resolve(), MAX_BYTES)
     agent, told = _loaded(raw, path, algorithm)
     if told:
