@@ -14,7 +14,7 @@ from jbrep.encoders.base import BaseEncoder, OwnEncoder
 from jbrep.encoders.header import IMPORTED, MAX_MAGNITUDE, EncoderHeader
 from jbrep.encoders.layers import ACTIVATIONS, MAX_UNITS, Layer, run
 from jbrep.envs.task import Task, check_same
-from jbrep.errors import InputError
+from jbrep.errors import InputError, choose
 from jbrep.records import container
 
 if TYPE_CHECKING:
@@ -247,9 +247,7 @@ def _check_layer(name: str, layer: Layer, inputs: int) -> int:
     units = max(1, layer.weight.shape[0]) if np.ndim(layer.weight) == 2 else 1
     _check_tensor(f"{name}.weight", layer.weight, (units, inputs))
     _check_tensor(f"{name}.bias", layer.bias, (units,))
-    if layer.activation not in ACTIVATIONS:
-        choices = ", ".join(ACTIVATIONS)
-        raise InputError(f"unknown activation {layer.activation!r}: choose one of {choices}")
+    choose(layer.activation, ACTIVATIONS, "activation")
     return units
 
 
