@@ -135,16 +135,15 @@ def write_references(
         there, damage = [], error
     rows = []
     for task, episodes in sorted(tasks, key=lambda each: each[0].name):
-        for policy in _POLICIES:
-            if policy != LOOKING or task.name in HEURISTICS:
-                own = [row for row in there if (row.task, row.policy) == (task.name, policy)]
-                if played_on.get(task.name, task) != task:
-                    own = []
-                if [row.episode for row in own] != [*range(episodes)]:
-                    own = _played(task, policy, episodes) or own
-                if damage and not own:
-                    raise damage
-                rows += own
+        for policy in _policies(task):
+            own = [row for row in there if (row.task, row.policy) == (task.name, policy)]
+            if played_on.get(task.name, task) != task:
+                own = []
+            if [row.episode for row in own] != [*range(episodes)]:
+                own = _played(task, policy, episodes) or own
+            if damage and not own:
+                raise damage
+            rows += own
     return write_csv(path, ("task", "policy", "episode", "return"), rows) if rows else None
 
 
@@ -155,8 +154,7 @@ def references_of(task: Task, episodes: int) -> dict[str, Array]:
     """
     return {
         policy: np.array([row.episode_return for row in rows])
-        for policy in _POLICIES
-        if policy != LOOKING or task.name in HEURISTICS
+        for policy in _policies(task)
         if (rows := _played(task, policy, episodes))
     }
 
@@ -176,6 +174,11 @@ def read_references(folder: Path, sha256: str | None) -> References:
     for row in read_rows(folder / REFERENCE_RETURNS, _Reference, sha256) if sha256 else []:
         found.setdefault(row.task, {}).setdefault(row.policy, []).append(row.episode_return)
     return found
+
+
+def _policies(task: Task) -> Iterator[str]:
+    """The reference policies that a task has."""
+    return (policy for policy in _POLICIES if policy != LOOKING or task.name in HEURISTICS)
 
 
 def _there(path: Path, before: Mapping[str, str]) -> list[_Reference]:
