@@ -3,6 +3,7 @@
 import math
 import re
 import shutil
+import sys
 import textwrap
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -155,13 +156,13 @@ def _line(cells: Sequence[str], columns: Sequence[int], widths: Sequence[int]) -
     return _GAP.join(aligned).rstrip()
 
 
-def facts(named: Mapping[str, str], width: int, indent: int = 2) -> str:
-    """A line for each fact, its name and its text; long texts are wrapped and indented."""
+def facts(named: Mapping[str, str], width: int | None, indent: int = 2) -> str:
+    """A line for each fact, its name and its text; those above the width, if any, are wrapped."""
     left = indent + max(map(len, named)) + 1
     return "\n".join(
         textwrap.fill(
             what,
-            width,
+            width or sys.maxsize,
             initial_indent=f"{'':{indent}}{name}".ljust(left),
             subsequent_indent=" " * left,
             break_on_hyphens=False,

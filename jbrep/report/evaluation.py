@@ -1,6 +1,5 @@
 """An evaluation of encoders as tables to read on a screen."""
 
-import sys
 from collections.abc import Callable, Iterator, Mapping
 
 from jbrep.encoders import FULL
@@ -128,7 +127,7 @@ def _columns(evaluation: Evaluation, width: int | None) -> str:
         for name, (words, _) in _COLUMNS.items()
         if evaluation.policy or name not in _OF_POLICY
     }
-    return facts(named, width or sys.maxsize, indent=0)
+    return facts(named, width, indent=0)
 
 
 def _worths(evaluation: Evaluation, worth: Worth, width: int | None) -> str:
@@ -143,7 +142,7 @@ def _worths(evaluation: Evaluation, worth: Worth, width: int | None) -> str:
             why = why or ["why isn't known"]
         lines[label] = "; ".join((interval(worth.returns[label], SIGNIFICANT), *why))
     title = worth_title(worth) + (f". {_LACKING}" if lacks else "")
-    told = facts(lines, width or sys.maxsize, indent=0)
+    told = facts(lines, width, indent=0)
     advised = wrapped(advice(evaluation, found), width) + "\n"
     return "\n".join((advised, wrapped(title, width), told, *_unsaid(evaluation, width)))
 
@@ -158,7 +157,7 @@ def _lacking(evaluation: Evaluation, width: int | None) -> str:
         label: lacks or (_NOTHING_NOW if label in short else "nothing")
         for label, lacks in _lacks(evaluation).items()
     }
-    told = facts(lines, width or sys.maxsize, indent=0)
+    told = facts(lines, width, indent=0)
     return "\n".join((wrapped(_LACKING, width), told, *unsaid))
 
 
