@@ -253,11 +253,20 @@ class OwnEncoder(BaseEncoder):
             return function(rows)
         import torch
 
-        module = self.given
-        weights = chain(module.parameters(), module.buffers())
-        like = next((each for each in weights if each.is_floating_point()), torch.empty(0))
-        with _evaluating(module), torch.no_grad():
+        like = floating(self.given)
+        with _evaluating(self.given), torch.no_grad():
             return function(torch.from_numpy(rows).to(like.device, like.dtype))
+
+
+def floating(module: Any) -> Any:
+    """A floating tensor of a torch module, to make others like it; one by default if it has none.
+
+    Parameters come before buffers.
+    """
+    import torch
+
+    tensors = chain(module.parameters(), module.buffers())
+    return next((each for each in tensors if each.is_floating_point()), torch.empty(0))
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from torch.nn import functional
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from jbrep.encoders import fold
+from jbrep.encoders.base import floating
 from jbrep.encoders.fold import Value, refusal
 from jbrep.encoders.layers import Layer, run
 from jbrep.encoders.operations import VALUE, operation
@@ -90,9 +91,7 @@ def _copy(module: nn.Module) -> nn.Module:
 
 def _outputs(module: nn.Module, rows: Any) -> Any:
     """What a module makes of rows (n, units): (n, units) float64."""
-    floats = (p for p in [*module.parameters(), *module.buffers()] if p.is_floating_point())
-    like = next(floats, torch.empty(0))
-    result = module(torch.as_tensor(rows, dtype=like.dtype))
+    result = module(torch.as_tensor(rows, dtype=floating(module).dtype))
     if not isinstance(result, Tensor) or result.ndim != 2:
         shape = tuple(result.shape) if isinstance(result, Tensor) else type(result).__name__
         raise InputError(f"it returns {shape}, expected one tensor (rows, units)")
