@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 from typing import Any
 
-import numpy as np
-
 from jbrep.report import facts
 from jbrep.report.answer import answer
 from jbrep.report.returns import return_form, returns_tables, steps
@@ -39,7 +37,7 @@ from jbrep.stats.scale import SOLVED
 from jbrep.study.packing import Forecast
 from jbrep.study.plan import Cell
 from jbrep.study.tables import by_run
-from jbrep.text import SIGNIFICANT, Table, duration, number, rounded, table, wrapped
+from jbrep.text import SIGNIFICANT, Table, duration, number, percentiles, rounded, table, wrapped
 
 _KEY, _NAME = "representation", attrgetter("representation")
 
@@ -112,7 +110,7 @@ def _last(tables: Tables, width: int | None) -> str:
             rows.append((run.label, *cells))
             continue
         step, final = max(returns[run.label, run.seed].items())
-        low, median, high = rounded(*np.percentile(final, (10, 50, 90)))
+        median, low, high = rounded(*percentiles(final).values())
         own = [number(shares[run.label, run.seed].get(name), ".2f") for name in names]
         rows.append((run.label, str(run.seed), f"{step:,}", median, f"[{low}, {high}]", *own))
     header = ("run", "seed", "steps", "median return", "10-90 %", *map(share_of, names))
