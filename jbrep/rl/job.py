@@ -300,26 +300,24 @@ class Job:
         Returns:
             The contents of run.json; or what they would be.
         """
-        if failure and exists(self.folder / RUN):
-            return self._record(agent, failure, read_run(self.folder).tables, b"")
-        (self.folder / RUN).unlink(missing_ok=True)  # of fewer steps, before its files change
+        folder, history = self.folder, self.history
+        if failure and exists(folder / RUN):
+            return self._record(agent, failure, read_run(folder).tables, b"")
+        (folder / RUN).unlink(missing_ok=True)  # of fewer steps, before its files change
         parts = agent.policy, self.run.task, self.encoder, self.settings
         trained = Trained(*parts, None, statistics_of(agent), action_repeat(agent))
         policy = b"" if failure else pack_whole(trained)
         tables = {
-            name: write_rows(self.folder / name, rows, kind)
-            for name, rows, kind in (
-                (EPISODES, self.history.episodes, Episode),
-                (EVALUATIONS, self.history.evaluations, Evaluation),
-            )
+            EPISODES: write_rows(folder / EPISODES, history.episodes, Episode),
+            EVALUATIONS: write_rows(folder / EVALUATIONS, history.evaluations, Evaluation),
         }
-        if self.history.infos:
-            tables[INFOS] = write_csv(self.folder / INFOS, Info._fields, self.history.infos)
+        if history.infos:
+            tables[INFOS] = write_csv(folder / INFOS, Info._fields, history.infos)
         if policy:
-            write_whole(self.folder / POLICY, policy)
-            write_whole(self.folder / POLICY_ZIP, policy_zip(agent, self.settings))
+            write_whole(folder / POLICY, policy)
+            write_whole(folder / POLICY_ZIP, policy_zip(agent, self.settings))
         result = self._record(agent, failure, tables, policy)
-        result.write(self.folder / RUN)  # last: the run has ended where it exists
+        result.write(folder / RUN)  # last: the run has ended where it exists
         return result
 
     def _record(
