@@ -16,6 +16,7 @@ from jbrep.methods.linear_forward import (
     ValuesWeight,
     check_targets,
     turns,
+    weights_of,
 )
 from jbrep.training.method import Learned, Network
 from jbrep.training.network import HIDDEN, get_architecture, seeded, stack
@@ -56,15 +57,10 @@ class Forward(Network, Learned, frozen=True, kw_only=True):
     learning_rate: LearningRate = 2e-3
     seed: Seed = 0
 
-    @property
-    def weights(self) -> dict[str, float]:
-        """Of the targets of a horizon."""
-        return {"changes": self.changes, "values": self.values, "reward": self.reward}
-
     def check_data(self, data: ScaledDataset) -> None:
         """As for `Method`."""
         super().check_data(data)
-        check_targets(data, self.name, {**self.weights, "inverse": self.inverse})
+        check_targets(data, self.name, {**weights_of(self), "inverse": self.inverse})
 
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
@@ -156,7 +152,7 @@ class ForwardObjective(Objective):
             self.predictors = Predictors(reads, sum(self._sizes))
             if self._inverse_weight:
                 self.inverse = stack((2 * latent, HIDDEN, self._action_size), "linear")
-        each = [w / n for w, n in zip(method.weights.values(), self._sizes, strict=True)]
+        each = [w / n for w, n in zip(weights_of(method).values(), self._sizes, strict=True)]
         turn = torch.from_numpy(turns(data)).float()[:, None]  # infinite for what is no angle
         for name, buffer in (
             ("_turn", turn.nan_to_num(posinf=0)),

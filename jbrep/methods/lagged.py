@@ -75,6 +75,12 @@ class Lagged:
         return [self.lags.index(lag) for lag in lags]
 
 
+def _correlations(metrics: Mapping[str, Any], latent: int) -> str:
+    """From the first unit to the last: 0.98 to 0.41."""
+    first, *others = metrics["spectrum"][:latent]
+    return f"{first:.2f} to {others[-1]:.2f}" if others else f"{first:.2f}"
+
+
 class Slow(Directions, frozen=True, kw_only=True):
     """Slow features: the l linear directions that change least over a lag (TICA).
 
@@ -94,9 +100,8 @@ class Slow(Directions, frozen=True, kw_only=True):
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
         """As for `Method`."""
-        first, *others = metrics["spectrum"][:latent]
-        last = f" to {others[-1]:.2f}" if others else ""
-        return f"changes slowly: units correlate {first:.2f}{last} with themselves a lag later"
+        found = _correlations(metrics, latent)
+        return f"changes slowly: units correlate {found} with themselves a lag later"
 
     def make(self, data: ScaledDataset) -> Made:
         """As for `ClosedForm`."""
@@ -145,9 +150,8 @@ class Vamp(Directions, frozen=True, kw_only=True):
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
         """As for `Method`."""
-        first, *others = metrics["spectrum"][:latent]
-        last = f" to {others[-1]:.2f}" if others else ""
-        return f"tells the state a lag later: units correlate {first:.2f}{last} with it"
+        found = _correlations(metrics, latent)
+        return f"tells the state a lag later: units correlate {found} with it"
 
     def make(self, data: ScaledDataset) -> Made:
         """As for `ClosedForm`."""

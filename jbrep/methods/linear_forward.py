@@ -48,15 +48,10 @@ class LinearForward(Directions, frozen=True, kw_only=True):
     values: ValuesWeight = 1.0
     reward: RewardWeight = 1.0
 
-    @property
-    def weights(self) -> dict[str, float]:
-        """Of the targets of a horizon."""
-        return {"changes": self.changes, "values": self.values, "reward": self.reward}
-
     def check_data(self, data: ScaledDataset) -> None:
         """As for `Method`."""
         super().check_data(data)
-        check_targets(data, self.name, self.weights)
+        check_targets(data, self.name, weights_of(self))
 
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
@@ -93,7 +88,7 @@ class LinearForward(Directions, frozen=True, kw_only=True):
         sizes = data.size, data.size, 1
         once = [
             np.full(n, np.sqrt(weight * data.size / n))
-            for n, weight in zip(sizes, self.weights.values(), strict=True)
+            for n, weight in zip(sizes, weights_of(self).values(), strict=True)
         ]
         return np.tile(np.concatenate(once), len(self.horizons))
 
@@ -128,6 +123,11 @@ def _moments(data: ScaledDataset, horizons: tuple[int, ...]) -> tuple[Moments, A
     covariance = products / count - np.outer(mean[:regressors], mean)
     moments = Moments(mean[:regressors], covariance[:, :regressors])
     return moments, covariance[:, regressors:], squares / count - mean[regressors:] ** 2
+
+
+def weights_of(method: Any) -> dict[str, float]:
+    """The weights of a method's targets at a horizon."""
+    return {part: getattr(method, part) for part in PARTS}
 
 
 def check_targets(data: ScaledDataset, kind: str, weights: Mapping[str, float]) -> None:
