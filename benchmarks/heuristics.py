@@ -4,8 +4,8 @@ import numpy as np
 
 from jbrep.envs import Lanes, describe
 from jbrep.envs.recording import episode_returns
+from jbrep.envs.task import Array
 from jbrep.jitterbug.heuristics import HEURISTICS
-from jbrep.jitterbug.tasks import Array
 
 EPISODES = 50
 

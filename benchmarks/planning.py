@@ -16,9 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.envs.description import as_task
+from jbrep.envs.task import Array
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.simulation import Simulation
-from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS, Array, JitterbugTask
+from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS, JitterbugTask
 from jbrep.play.sources import find_player
 
 COPIES, HORIZON, HELD = 16, 80, 10  # robots; steps that they look ahead; steps until replanning

@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from jbrep.envs.task import Array
 from jbrep.jitterbug.simulation import Simulation
-from jbrep.jitterbug.tasks import TASKS, Array, Readings
+from jbrep.jitterbug.tasks import TASKS, Readings
 from jbrep.rl.files import EVALUATION_SEED
 
 RUN = ["task", "algorithm", "representation", "seed"]  # columns that tell it

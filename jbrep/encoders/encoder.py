@@ -5,12 +5,11 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jbrep.coordinates import is_torch, library_of
 from jbrep.coordinates.nearest import nearest
 from jbrep.dataset import Scaler
-from jbrep.encoders.base import BaseEncoder, OwnEncoder
+from jbrep.encoders.base import BaseEncoder, Float32, OwnEncoder
 from jbrep.encoders.header import IMPORTED, MAX_MAGNITUDE, EncoderHeader
 from jbrep.encoders.layers import ACTIVATIONS, MAX_UNITS, Layer, run
 from jbrep.envs.task import Task, check_same
@@ -20,7 +19,6 @@ from jbrep.records import container
 if TYPE_CHECKING:
     from torch.nn import Module
 
-Float32 = NDArray[np.float32]
 Layers = tuple[Layer, ...]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 

@@ -7,13 +7,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jbrep.encoders.fold import Action, Chain
+from jbrep.encoders.fold import Action, Array, Chain
 from jbrep.encoders.layers import ACTIVATIONS, EPSILON
 from jbrep.errors import InputError
-
-Array = NDArray[np.float64]
 
 VALUE: Any = object()  # stands for what depends on the observation among the arguments
 NOTHING = Action(lambda chain: chain, lambda values: values)

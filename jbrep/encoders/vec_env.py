@@ -8,14 +8,12 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from jbrep.encoders.base import BaseEncoder, as_encoder
+from jbrep.encoders.base import BaseEncoder, Float32, as_encoder
 from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.description import describe
 from jbrep.envs.lanes import State, check_actions
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
-
-Float32 = NDArray[np.float32]
 
 
 def agent_spaces(task: Task, encoder: BaseEncoder | None) -> tuple[spaces.Box, spaces.Box]:

@@ -13,7 +13,7 @@ from gymnasium.vector import VectorEnv, VectorObservationWrapper, VectorWrapper
 from gymnasium.vector.utils import batch_space, iterate
 from numpy.typing import NDArray
 
-from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.base import BaseEncoder, Float32
 from jbrep.encoders.shipped import find
 from jbrep.envs.description import as_task, describe
 from jbrep.envs.make import flattener
@@ -21,7 +21,6 @@ from jbrep.envs.names import find_spec
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 
-Float32 = NDArray[np.float32]
 _Env = gymnasium.Env[Any, Any]
 _VectorEnv = VectorEnv[Any, Any, Any]
 

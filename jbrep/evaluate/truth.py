@@ -5,12 +5,11 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jbrep.envs.task import Task
+from jbrep.envs.task import Array, Task
 from jbrep.jitterbug.tasks import TASKS
 
-Array = NDArray[np.float64]
 Columns = dict[str, Array]
 
 _ROTATION = ("orientation_w", "orientation_x", "orientation_y", "orientation_z")

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from jbrep.envs.task import Array
 from jbrep.errors import InputError
-from jbrep.jitterbug.tasks import Array
 
 RANDOM = "random"  # another body in each episode
 PUBLISHED = -1  # the number of the published robot, which isn't drawn

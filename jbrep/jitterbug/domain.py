@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from jbrep.envs.task import Array
 from jbrep.errors import InputError
 from jbrep.jitterbug import tasks
 from jbrep.jitterbug.bodies import read_xml
-from jbrep.jitterbug.tasks import Array, Readings
+from jbrep.jitterbug.tasks import Readings
 from jbrep.opengl import prepare_opengl
 
 prepare_opengl()  # dm_control chooses its platform, and opens EGL, when it is imported

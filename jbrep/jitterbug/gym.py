@@ -13,11 +13,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from jbrep.envs.lanes import check_actions
-from jbrep.envs.task import Task
+from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError, choose
 from jbrep.jitterbug.bodies import check_body
 from jbrep.jitterbug.simulation import Simulation
-from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, Array, JitterbugTask, get_task
+from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, JitterbugTask, get_task
 from jbrep.opengl import has_display, no_opengl, prepare_opengl
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from jbrep.coordinates import wrapped
-from jbrep.jitterbug.tasks import Array, get_task
+from jbrep.envs.task import Array
+from jbrep.jitterbug.tasks import get_task
 
 
 @dataclass(frozen=True)

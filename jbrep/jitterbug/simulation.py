@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.mujoco import turned, turned_quaternion
+from jbrep.envs.task import Array
 from jbrep.envs.varied import put_factors, velocity_after
 from jbrep.jitterbug import bodies, model
-from jbrep.jitterbug.tasks import QUATERNION, Array, JitterbugTask, Readings, yaw_direction
+from jbrep.jitterbug.tasks import QUATERNION, JitterbugTask, Readings, yaw_direction
 
 _UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)

@@ -10,13 +10,10 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jbrep.coordinates import wrapped
-from jbrep.envs.task import SHORT_NAMES, Feature, Frame, Kind, Task
+from jbrep.envs.task import SHORT_NAMES, Array, Feature, Frame, Kind, Task
 from jbrep.errors import choose
-
-Array = NDArray[np.float64]
 
 CONTROL_TIMESTEP = 0.01  # [s]
 EPISODE_STEPS = 1000  # control steps

@@ -8,8 +8,9 @@ from msgspec import Meta
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
+from jbrep.envs.task import Array
 from jbrep.methods.linear import Directions, direction_code, whitening
-from jbrep.methods.passes import Array, Block, blocks, check_enough
+from jbrep.methods.passes import Block, blocks, check_enough
 from jbrep.training.method import Made
 from jbrep.training.settings import Steps
 

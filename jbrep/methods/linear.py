@@ -7,8 +7,8 @@ import numpy as np
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.layers import Layer
+from jbrep.envs.task import Array
 from jbrep.errors import InputError
-from jbrep.methods.passes import Array
 from jbrep.training.method import ClosedForm, Coded, Made
 from jbrep.training.objective import Layers
 

@@ -10,9 +10,10 @@ from msgspec import Meta
 from jbrep.coordinates import wrapped
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
+from jbrep.envs.task import Array
 from jbrep.errors import InputError
 from jbrep.methods.linear import Directions, direction_code, whitening
-from jbrep.methods.passes import Array, blocks, check_enough
+from jbrep.methods.passes import blocks, check_enough
 from jbrep.training.method import Made
 from jbrep.training.settings import RewardWeight, Steps, Weight
 

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders.layers import Layer
+from jbrep.envs.task import Array
 from jbrep.errors import InputError
 from jbrep.methods.linear import dense
-from jbrep.methods.passes import Array
 from jbrep.training.method import Learned
 from jbrep.training.network import seeded
 from jbrep.training.objective import Layers, Objective

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
+from jbrep.envs.task import Array
 from jbrep.errors import InputError
 from jbrep.training.windows import first_rows
-
-Array = NDArray[np.float64]
 
 _BLOCK = 1 << 15  # windows in a block
 _NUMBERS = 1 << 22  # at most in its wide arrays: 32 MiB
