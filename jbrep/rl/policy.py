@@ -25,7 +25,7 @@ from jbrep.rl.files import (
 from jbrep.rl.overrides import check_shape
 from jbrep.rl.policy_file import read
 from jbrep.rl.run_settings import RunSettings
-from jbrep.rl.trained import Trained, acting, build
+from jbrep.rl.trained import Trained, acting_prefix, build
 from jbrep.training.trainer import single_torch_thread
 
 
@@ -57,10 +57,10 @@ def load_run(folder: Path, encoder: Any = None) -> Trained:
     path = folder / CHECKPOINT
     tensors, header = read_checkpoint(path)
     built = _untrained(folder, header.settings, encoder)._replace(step=header.step)
-    part = "" if acting(built.policy) is built.policy else "actor."
+    part = f"{PARAMETERS}policy.{acting_prefix(built.policy)}"
     weights = {
         name: values
-        for name, values in without(f"{PARAMETERS}policy.{part}", tensors).items()
+        for name, values in without(part, tensors).items()
         if not name.startswith("optimizer.")
     }
     return built.with_weights(weights, tensors, path)

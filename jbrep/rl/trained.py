@@ -101,6 +101,11 @@ def acting(policy: BasePolicy) -> BasePolicy:
     return getattr(policy, "actor", policy)
 
 
+def acting_prefix(policy: BasePolicy) -> str:
+    """What the names of a policy's weights begin with in the part that acts, if it is a part."""
+    return "" if acting(policy) is policy else "actor."
+
+
 def fill(policy: BasePolicy, weights: Tensors, path: Path) -> None:
     """Put weights, by their names, into a policy or its acting part: all it has, and no others.
 
@@ -154,8 +159,8 @@ def pack(trained: Trained, run: str) -> bytes:
 def pack_whole(trained: Trained) -> bytes:
     """The bytes of the policy's file in a run's folder, with all that a run can begin with."""
     assert trained.settings is not None
-    parts = {} if acting(trained.policy) is trained.policy else trained.policy.state_dict()
-    others = {name: each for name, each in parts.items() if not name.startswith("actor.")}
+    weights, acts = trained.policy.state_dict(), acting_prefix(trained.policy)
+    others = {name: each for name, each in weights.items() if not name.startswith(acts)}
     return _pack(trained, trained.settings.name, _named(TRAINING, others))
 
 
@@ -183,7 +188,7 @@ def _named(prefix: str, weights: Mapping[str, torch.Tensor]) -> Tensors:
 
 def fill_whole(file: PolicyFile, policy: BasePolicy) -> None:
     """As `fill`, with the weights that only training needs, too, which a run's own file has."""
-    prefix = "" if acting(policy) is policy else "actor."
+    prefix = acting_prefix(policy)
     acts = {f"{prefix}{name}": values for name, values in file.weights.items()}
     fill(policy, acts | without(TRAINING, file.tensors), file.path)
 
