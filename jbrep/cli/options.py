@@ -7,7 +7,7 @@ import click
 from msgspec import NODEFAULT, inspect
 
 from jbrep.cli.base import COUNT, with_options
-from jbrep.records.keys import Key, keys_of
+from jbrep.records.keys import Key, keys_of, option_name
 from jbrep.records.record import Record, converted, from_text
 from jbrep.records.words import bare
 
@@ -44,7 +44,7 @@ def _option(key: Key) -> Callable[[_Command], _Command]:
     default = f"  [default: {key.default_in_words}]" if key.default_in_words else ""
     has_default = key.default is not NODEFAULT
     return click.option(
-        f"--{key.name.replace('_', '-')}",
+        option_name(key.name),
         key.field,
         type=_TYPES.get(type(node), click.STRING),
         is_flag=isinstance(node, inspect.BoolType),

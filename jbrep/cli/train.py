@@ -16,7 +16,7 @@ from jbrep.cli.output import tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError, choose
 from jbrep.methods.kinds import KINDS
-from jbrep.records.keys import Key, keys_of
+from jbrep.records.keys import Key, keys_of, option_name
 from jbrep.records.words import bare
 
 if TYPE_CHECKING:
@@ -62,10 +62,10 @@ class _Making(Variadic):
         key = next(iter(taking.values()))
         kind, words = bare(key.kind), f"{key.help}{self._use(taking)}"
         if isinstance(kind, inspect.BoolType):
-            return click.Option([_option(name)], is_flag=True, default=None, help=words)
+            return click.Option([option_name(name)], is_flag=True, default=None, help=words)
         several = name == "latent" or isinstance(kind, inspect.CollectionType | inspect.DictType)
         metavar = "VALUE..." if several else "VALUE"
-        return click.Option([_option(name)], multiple=several, metavar=metavar, help=words)
+        return click.Option([option_name(name)], multiple=several, metavar=metavar, help=words)
 
     def _use(self, taking: Mapping[str, Key]) -> str:
         """Which kinds take a setting, and its default: [slow: 10; forward: 1,5,10,20]."""
@@ -98,11 +98,6 @@ class _Making(Variadic):
                 formatter.write_dl(rows)
 
 
-def _option(setting: str) -> str:
-    """The option that gives a setting: --batch-size."""
-    return f"--{setting.replace('_', '-')}"
-
-
 def _help_of(options: Sequence[click.Parameter], ctx: click.Context) -> list[tuple[str, str]]:
     return [record for each in options if (record := each.get_help_record(ctx))]
 
@@ -131,7 +126,9 @@ def _given(kind: str, options: Mapping[str, Any]) -> dict[str, Any]:
     for name in given:
         if not method.takes(name):
             kinds = ", ".join(each for each, m in METHODS.items() if m.takes(name))
-            raise InputError(f"{kind} takes no {_option(name)}: leave it out; it is for {kinds}")
+            raise InputError(
+                f"{kind} takes no {option_name(name)}: leave it out; it is for {kinds}"
+            )
     if not method.takes("latent"):
         return given
     if "latent" not in given:

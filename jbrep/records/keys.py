@@ -6,7 +6,7 @@ import msgspec
 from msgspec import NODEFAULT, UNSET, inspect
 
 from jbrep.records.record import Record, default_of
-from jbrep.records.words import type_of
+from jbrep.records.words import described, type_of
 
 
 class Key(NamedTuple):
@@ -54,7 +54,10 @@ def keys_of(kind: type[Record]) -> list[Key]:
 
 def _words(node: inspect.Type) -> tuple[str, str]:
     """A field's help, and its default in words."""
-    if not isinstance(node, inspect.Metadata):
-        return "", ""
-    described, extra = node.extra_json_schema or {}, node.extra or {}
-    return str(described.get("description", "")), str(extra.get("default", ""))
+    extra = node.extra or {} if isinstance(node, inspect.Metadata) else {}
+    return described(node).get("description", ""), str(extra.get("default", ""))
+
+
+def option_name(key: str) -> str:
+    """The option that gives a key: --batch-size."""
+    return f"--{key.replace('_', '-')}"

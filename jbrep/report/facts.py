@@ -13,6 +13,7 @@ from jbrep.encoders.base import OWN
 from jbrep.encoders.shipped import UNLEARNED, find, names
 from jbrep.envs.names import modules_of
 from jbrep.errors import InputError
+from jbrep.records.keys import option_name
 from jbrep.records.record import to_plain
 from jbrep.report.tables import Tables
 from jbrep.report.words import shown_number
@@ -299,7 +300,7 @@ def _command(shared: Label, folder: str, encoder: str) -> str:
     view = task.view
     parts = ["jbrep", "rl", "--task", task.name.removesuffix(view.suffix) if view else task.name]
     for name in _OPTIONS:
-        parts += [f"--{name.replace('_', '-')}", str(getattr(settings, name))]
+        parts += [option_name(name), str(getattr(settings, name))]
     for name in view.hidden if view else ():
         parts += ["--hide", name]
     if view and view.history > 1:
