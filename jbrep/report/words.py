@@ -55,9 +55,9 @@ _CLAIMS = {  # as a sentence, with a place for the percentage that may be lost; 
     WITHIN_HALF.name: ("They lose at most {} of it", _KEPT),
 }
 _BESIDE = {  # a claim's verdict: what else is known of it
-    "not worse": ("Difference of final returns", "final_return_difference"),
-    "less variance": ("Ratio of variances of final returns", "variance_ratio"),
-    "faster": ("Ratio of median steps to half of the gain", "steps_to_50_percent_ratio"),
+    NOT_WORSE.name: ("Difference of final returns", "final_return_difference"),
+    LESS_VARIANCE.name: ("Ratio of variances of final returns", "variance_ratio"),
+    FASTER.name: ("Ratio of median steps to half of the gain", "steps_to_50_percent_ratio"),
 }
 
 
