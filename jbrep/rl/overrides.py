@@ -81,7 +81,7 @@ def overridden(algorithm: str, preset: str, overrides: Mapping[str, Any]) -> Hyp
         algorithm: a key of CLASSES.
         preset: a key of PRESETS.
         overrides: by the names of stable-baselines3's parameters, of the algorithm or its policy,
-            or num_envs, noise, normalize and optimizer_kwargs.
+            or of the other fields of `Hyperparameters`.
 
     Raises:
         InputError: an unknown algorithm, preset or setting, or a value that it can't have.

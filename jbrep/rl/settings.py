@@ -20,7 +20,7 @@ CLASSES = {  # by the names of algorithms
 CPU, CUDA = "cpu", "cuda"
 COHORT, SB3 = "cohort", "sb3"
 PRECISIONS = FLOAT32, BFLOAT16 = "float32", "bfloat16"
-PAPER, MODERN, WIDE = "paper", "modern", "wide"  # presets; the paper's unless another is named
+PAPER, MODERN, WIDE = "paper", "modern", "wide"  # presets; a name without one has the paper's
 MAX_STEPS = 10**12  # of training
 MAX_EPISODES = 10_000  # of an evaluation
 

@@ -68,7 +68,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def explore(self, observation: Tensor, normals: Sequence[Tensor]) -> Tensor:
-        """Actions in [-1, 1] before action noise, and draws for them, (n, lanes, k) each."""
+        """Actions in [-1, 1] before action noise, by draws for them, (n, lanes, k) each."""
 
     @abstractmethod
     def update(

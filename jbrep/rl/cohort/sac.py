@@ -58,7 +58,7 @@ class SAC(Algorithm):
     def update(
         self, batch: Batch, normals: Sequence[Tensor], n_updates: int, gradient_step: int
     ) -> Losses:
-        """As in the class above; all losses are by the entropy coefficient of before."""
+        """As for `Algorithm`; all losses are by the entropy coefficient of before."""
         normal, next_normal = normals
         ent_coef = self.log_ent_coef.exp()
         critic_loss = self.update_critic(batch, next_normal, ent_coef)

@@ -42,7 +42,7 @@ class TD3(Algorithm):
     def update(
         self, batch: Batch, normals: Sequence[Tensor], n_updates: int, gradient_step: int
     ) -> Losses:
-        """As in the class above; the actor and the targets follow with a delay."""
+        """As for `Algorithm`; the actor and the targets follow with a delay."""
         losses = {"critic_loss": self.update_critic(batch, normals[0])}
         if n_updates % self.policy_delay == 0:
             losses["actor_loss"] = self.update_actor(batch.observation)
