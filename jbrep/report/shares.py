@@ -9,7 +9,7 @@ from jbrep.report.tables import Tables
 from jbrep.report.words import shown
 from jbrep.rl.files import FAILED
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within, unless_few
-from jbrep.study.tables import RunInfo, by_run
+from jbrep.study.tables import RunInfo, by_run, run_of
 
 Cells = Mapping[str, Mapping[str, str]]  # by the column's head, then by label
 
@@ -25,9 +25,9 @@ def shares_of_runs(tables: Tables) -> dict[tuple[str, int], dict[str, float]]:
     by_task: dict[str, list[RunInfo]] = {}
     told: dict[tuple[str, int], list[RunInfo]] = {}
     for row in tables.infos:
-        if row.step == last.get(row.run):
+        if row.step == last.get(run_of(row)):
             by_task.setdefault(row.task, []).append(row)
-            told.setdefault(row.run, []).append(row)
+            told.setdefault(run_of(row), []).append(row)
     known = {task: shares(_by_name(rows)) for task, rows in by_task.items()}
     return {
         (run.label, run.seed): {

@@ -67,11 +67,6 @@ class RunInfo(NamedTuple):
     name: str
     value: float
 
-    @property
-    def run(self) -> tuple[str, int]:
-        """The run's label and seed."""
-        return f"{self.task}/{self.algorithm}/{self.representation}", self.seed
-
 
 class _Reference(NamedTuple):
     """A row of references.csv: an episode of a reference policy."""
@@ -82,12 +77,16 @@ class _Reference(NamedTuple):
     episode_return: float
 
 
+def run_of(row: Return | RunInfo) -> tuple[str, int]:
+    """The label and the seed of a row's run."""
+    return f"{row.task}/{row.algorithm}/{row.representation}", row.seed
+
+
 def by_run(returns: Iterable[Return]) -> dict[tuple[str, int], dict[int, list[float]]]:
     """The returns of each run's evaluations, by the run's label and seed, then by step."""
     found: dict[tuple[str, int], dict[int, list[float]]] = {}
     for row in returns:
-        label = f"{row.task}/{row.algorithm}/{row.representation}"
-        by_step = found.setdefault((label, row.seed), {})
+        by_step = found.setdefault(run_of(row), {})
         by_step.setdefault(row.step, []).append(row.episode_return)
     return found
 
