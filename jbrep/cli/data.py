@@ -270,8 +270,8 @@ def export(data: Path, to: str, out: Path) -> None:
 def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
     """Make a data set of other tools' data, or of logs.
 
-    SOURCE is a file (.csv, .tsv, .txt, .parquet, .npz, .hdf5, .h5, .bag, .mcap, .db3), the folder of a
-    bag, of a LeRobot or a Minari data set, or the id of the latter in MINARI_DATASETS_PATH; an
+    SOURCE is a file (.csv, .tsv, .txt, .parquet, .npz, .hdf5, .h5, .bag, .mcap, .db3), the folder
+    of a bag, of a LeRobot or a Minari data set, or the id of the latter in MINARI_DATASETS_PATH; an
     episode ends with each of several. Without --task, the task is the one that the source names, or
     is made from the data alone. See docs/logs.md, and docs/data-format.md for what is known by its
     name.

@@ -53,8 +53,8 @@ _KEPT = "the same command resumes agents"
 )
 @click.option(
     "--policy",
-    help="A policy that does the task well: a run's folder, or a policy by name. By default the task's "
-    "hand-written policy, if it has one.",
+    help="A policy that does the task well: a run's folder, or a policy by name. By default the "
+    "task's hand-written policy, if it has one.",
 )
 @click.option(
     "--truth",

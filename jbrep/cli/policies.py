@@ -336,7 +336,9 @@ def policies(as_json: bool) -> None:
 @click.command(epilog="Example: jbrep behaviour runs/full runs/dae-4 --out behaviour")
 @click.argument("policies", nargs=-1, required=True)
 @task_option
-@click.option("--episodes", default=100, show_default=True, type=POSITIVE, help="Of each run or policy.")
+@click.option(
+    "--episodes", default=100, show_default=True, type=POSITIVE, help="Of each run or policy."
+)
 @click.option(
     "--target-yaw", default=45.0, show_default=True, help="Where every target points [degrees]."
 )

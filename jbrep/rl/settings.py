@@ -102,7 +102,7 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
     ] = "float32"
     device: Annotated[
         Literal["cpu", "cuda", "auto"],
-        Meta(description="Where a cohort takes its gradient steps; auto is cuda where there is one."),
+        Meta(description="Where a cohort takes gradient steps; auto is cuda where there is one."),
     ] = "cpu"
 
     def check(self) -> None:
