@@ -79,12 +79,11 @@ def with_bodies(seeds, body, **more):
     return simulation
 
 
-def test_a_lane_moves_like_a_single_simulation_of_its_body():
-    simulation = with_bodies(range(3), "random", materials=True)
+def assert_moves_like(simulation, models):
+    """Each lane moves bit for bit like a single simulation of its model."""
     start, tape = simulation.state, []
     drive(simulation)
-    for lane, number in enumerate(start["body"].astype(int)):
-        model = plain_model(draw(number, materials=True))
+    for lane, model in enumerate(models):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = start["qpos"][lane], start["qvel"][lane]
         for step in range(60):
@@ -93,6 +92,22 @@ def test_a_lane_moves_like_a_single_simulation_of_its_body():
         tape.append(np.concatenate([data.qpos, data.qvel]))
     now = simulation.readings
     np.testing.assert_array_equal(np.hstack([now.qpos, now.qvel]), tape)
+
+
+def test_a_lane_moves_like_a_single_simulation_of_its_body():
+    simulation = with_bodies(range(3), "random", materials=True)
+    numbers = simulation.state["body"].astype(int)
+    assert_moves_like(simulation, [plain_model(draw(n, materials=True)) for n in numbers])
+
+
+def test_a_lane_s_model_has_its_friction_and_mass():
+    simulation, factors = with_bodies(range(3), 7), np.array([(1, 1), (1, 2), (0.2, 0.5)])
+    simulation.reset(range(3), [np.random.default_rng(4)] * 3, factors=factors)
+    models, usual = [simulation.model_of(lane) for lane in range(3)], plain_model(draw(7))
+    for model, (friction, mass) in zip(models, factors, strict=True):
+        np.testing.assert_allclose(model.geom_friction, friction * usual.geom_friction)
+        np.testing.assert_allclose(model.body_subtreemass, mass * usual.body_subtreemass)
+    assert_moves_like(simulation, models)
 
 
 def test_all_lanes_have_the_body_of_the_number():

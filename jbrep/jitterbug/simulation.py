@@ -64,7 +64,7 @@ class Simulation:
         self._numbers = np.full(num_lanes, first, np.int64)
         self._factors = np.ones((num_lanes, 2))  # of friction and mass
         self._models = [model.fast_model(self._drawn(first))] * num_lanes
-        self._shown: dict[int, mujoco.MjModel] = {}
+        self._shown: dict[tuple[float, ...], mujoco.MjModel] = {}
         # persistent: a step reuses what has already been computed for the readings
         self._batch = Batch(self._models[0], num_lanes, num_threads or 0, persistent=True)
         self._control = self._batch.bind("ctrl")
@@ -194,23 +194,25 @@ class Simulation:
         for lane, number, own in zip(lanes, numbers, factors, strict=True):
             if number != self._numbers[lane] or (own != self._factors[lane]).any():
                 self._numbers[lane], self._factors[lane] = number, own
-                self._models[lane] = self._model(int(number), *own.tolist())
+                usual = model.fast_model(self._drawn(int(number)))
+                self._models[lane] = self._varied(lane, usual, self._scratch)
                 changed = True
         if changed:
             self._batch.set_models(self._models)
             self._shown.clear()
 
-    def _model(self, number: int, friction: float, mass: float) -> mujoco.MjModel:
-        usual = model.fast_model(self._drawn(number))
+    def _varied(self, lane: int, usual: mujoco.MjModel, data: mujoco.MjData) -> mujoco.MjModel:
+        """The usual model of a lane's body with the lane's factors; itself where they are 1."""
+        friction, mass = self._factors[lane].tolist()
         if friction == mass == 1:
             return usual
         varied = copy.copy(usual)
-        put_factors(varied, usual, friction, mass, self._scratch)
+        put_factors(varied, usual, friction, mass, data)
         return varied
 
     @cached_property
     def _scratch(self) -> mujoco.MjData:
-        """Of the sizes that all bodies' models have."""
+        """Of the sizes that all bodies' fast models have."""
         return mujoco.MjData(self._models[0])
 
     def push(self, velocity: Array) -> None:
@@ -252,11 +254,13 @@ class Simulation:
         return self.task.reward(self.readings)
 
     def model_of(self, lane: int) -> mujoco.MjModel:
-        """The model of a lane's robot as described; a new one once it has another body."""
+        """The model of a lane's robot as described, with its factors; a new one once it differs."""
         number = int(self._numbers[lane])
-        if number not in self._shown:
-            self._shown[number] = model.plain_model(self._drawn(number))
-        return self._shown[number]
+        key = (number, *self._factors[lane].tolist())
+        if key not in self._shown:
+            usual = model.plain_model(self._drawn(number))
+            self._shown[key] = self._varied(lane, usual, mujoco.MjData(usual))
+        return self._shown[key]
 
     def copy_data(self, lane: int, data: mujoco.MjData | None = None) -> mujoco.MjData:
         """A lane as a MuJoCo data object of `model_of(lane)`, to render or inspect."""
