@@ -132,15 +132,36 @@ def test_a_controller_keeps_the_history_itself(seen):
     np.testing.assert_allclose(controller(several)[0], alone(several[0]), atol=1e-6)
 
 
-def test_a_robot_keeps_the_history_of_an_exported_policy(seen, tmp_path, monkeypatch):
+@pytest.fixture
+def on_robot(seen, tmp_path, monkeypatch):
+    """A policy as a function and on a robot, which holds each action for three steps; sensors."""
     monkeypatch.syspath_prepend("examples/robot")
     controller = controller_of(randomised("td3", "full", seen))
     export(controller, tmp_path / "it.onnx")
     robot = import_module("controller").Controller(str(tmp_path / "it.onnx"))
     low, high = np.array([(each.low, each.high) for each in seen.features[: robot.size]]).T
     shown = np.random.default_rng(0).uniform(low, high, (8, robot.size)).astype(np.float32)
+    return controller, robot, shown
+
+
+def test_a_robot_keeps_the_history_of_an_exported_policy(on_robot):
+    controller, robot, shown = on_robot
     for step, sensors in enumerate(shown):
         np.testing.assert_allclose(robot.act(step, sensors), controller(sensors), atol=1e-6)
+
+
+def test_a_robot_goes_on_after_sensors_that_are_not_believed(on_robot):
+    controller, robot, shown = on_robot
+    unknown = np.full(robot.size, np.nan, np.float32)
+    first, _, third = (robot.act(step, shown[step]) for step in range(3))
+    assert robot.act(3, unknown) is None  # where another action was due
+    late = robot.act(4, shown[4])
+    past = np.concatenate([shown[4], shown[2], shown[2], robot.safe, third])
+    expected = controller.acting.actions(controller.encoder.encode(past))
+    np.testing.assert_allclose(late, expected, atol=1e-6)
+    assert robot.act(5, shown[5]) is late
+    assert robot.act(0, unknown) is None  # another episode, which knows nothing of this one
+    np.testing.assert_array_equal(robot.act(1, shown[0]), first)
 
 
 def test_what_a_view_refuses(task, seen):

@@ -46,17 +46,27 @@ class Controller:
         bounds = np.array([said["action"]["low"], said["action"]["high"]], np.float32)
         self.safe = np.clip(np.zeros_like(bounds[0]), *bounds)  # no torque
         self.seconds: list[float] = []  # that each action took
-        self._action = self.safe
+        self._action, self._chosen = self.safe, -1  # the newest, and its step // repeat
 
     def act(self, step: int, sensors: np.ndarray) -> np.ndarray | None:
-        """The action at a control step; None for sensors that can't be believed."""
+        """The action at a control step; None, for the safe one, if sensors can't be believed.
+
+        The history then has the sensors of the step before once more.
+        """
+        if step == 0:  # another episode
+            self._states.clear()
+            self._chosen = -1
         if not np.isfinite(sensors).all() or ((sensors < self._low) | (sensors > self._high)).any():
+            if self._states:
+                self._states.appendleft(self._states[0])
+                self._actions.appendleft(self.safe)
             return None
-        if step == 0 or not self._states:  # before the start it stood still
+        if not self._states:  # before the start it stood still
             self._states.extend([sensors] * (self._states.maxlen or 1))
             self._actions.extend([self.safe] * (self._actions.maxlen or 0))
         self._states.appendleft(sensors)
-        if step % self.repeat == 0:
+        if step // self.repeat != self._chosen:
+            self._chosen = step // self.repeat
             began = time.perf_counter()
             seen = np.concatenate([*self._states, *self._actions])[None]
             (actions,) = self._session.run(["action"], {"observation": seen})
