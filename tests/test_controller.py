@@ -1,5 +1,6 @@
 """Policies as functions of observations: they act as the runs that they were taken from."""
 
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -144,18 +145,28 @@ def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("history", [1, 2])
-def test_a_policy_that_sees_less_takes_no_more(history):
+def test_what_is_refused_changes_nothing(history):
+    """A policy that sees less takes no more; steps that hold an action are checked, too."""
     seen = describe("Pendulum-v1", hidden=["obs_0"], history=history)
-    run = Run.of(seen, "sac", preset="paper")
+    run = Run.of(seen, "sac", preset="paper", overrides={"action_repeat": 2})
     encoder = find("full", seen)
-    controller = controller_of(build(run.settings(encoder), encoder, Path("here")))
-    assert controller([0.1, 0.2]).shape == (1,)
-    for wrong in (
-        [0.3],
-        [0.3, 0.1, 0.2],
-    ):  # the whole reading, of which it would take the first two
-        with pytest.raises(InputError, match="numbers observed: it takes 2, of obs_1, obs_2"):
-            controller(wrong)
+    trained = build(run.settings(encoder), encoder, Path("here"))
+    controller, other = controller_of(trained), controller_of(trained)
+    takes = "the policy takes 2 numbers, of obs_1, obs_2; or a row of them for each robot"
+    refused = [
+        ([0.3], takes),
+        ([0.3] * (2 * history + 2), takes),  # of which it would take the first two
+        (0.3, takes),
+        ([0.1, np.nan], "obs_2 is not finite: the policy takes finite numbers"),
+    ]
+    several = ([[0.1, 0.2]] * 3, "of shape (3, 2) after others of (2,): give the same robots, or")
+    for step in range(4):
+        for wrong, why in [*refused, several] if step else refused:
+            with pytest.raises(InputError, match=re.escape(why)):
+                controller(wrong)
+        np.testing.assert_array_equal(controller([0.1 * step, 0.2]), other([0.1 * step, 0.2]))
+    controller.reset()
+    assert controller(several[0]).shape == (3, 1)
 
 
 def test_what_a_policy_lacks_is_named(tmp_path):
@@ -187,13 +198,16 @@ def test_a_policy_that_makes_no_network_is_refused(changes, activation, message,
 
 def test_what_it_cannot_act_on_is_refused():
     controller = controller_of(randomised("td3", "full"))
-    with pytest.raises(InputError, match=f"takes observations of {TASK.size} numbers, but got"):
+    with pytest.raises(InputError, match=f"the policy takes {TASK.size} numbers, of position_x, "):
         controller([0.0])
     one_array = rf"is a dict: the policy takes {TASK.size} numbers in one array, as gymnasium\.spac"
     with pytest.raises(InputError, match=one_array):
         controller({"position": np.zeros(TASK.size)})
-    with pytest.raises(InputError, match="the policy's action is not finite"):
-        controller(np.full(TASK.size, np.nan))
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(InputError, match="the policy's action is not finite"),
+    ):
+        controller(np.full(TASK.size, 1e38))
     assert controller(np.zeros(TASK.size)).shape == (TASK.action_size,)  # there is none to hold
     run = Run.of(TASK, "sac", overrides={"use_sde": True}, trainer="sb3")
     encoder = find("full", TASK)

@@ -13,9 +13,8 @@ from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.file import load
 from jbrep.encoders.fold import Chain
 from jbrep.encoders.layers import ACTIVATIONS, Layer, activate, run
-from jbrep.envs.recording import held
 from jbrep.envs.view import Window
-from jbrep.errors import DamageError, InputError, choose, first_line
+from jbrep.errors import DamageError, InputError, choose, first_line, listed
 from jbrep.records.container import Tensors
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, POLICY, RUN, read_finished
@@ -74,6 +73,13 @@ class Acting(NamedTuple):
         return library.minimum(library.maximum(action, self.low), self.high)  # despite rounding
 
 
+class _Seen(NamedTuple):
+    """What a policy sees of observations."""
+
+    observation: NDArray[np.float32]  # with its history, if the policy was trained with one
+    window: Window | None  # that the history is from
+
+
 class Controller:
     """A trained policy, from a robot's observations to its actions.
 
@@ -124,16 +130,17 @@ class Controller:
         return f"Controller({self.task.name}: {size} numbers to {actions}, {self.encoder.name})"
 
     def reset(self) -> None:
-        """Begin another episode: the next call chooses an action."""
-        self._act = held(self._chosen, self.action_repeat)
-        self._held = np.empty(0, np.float32)  # the action of the last call
+        """Begin another episode, of any number of robots: the next call chooses an action."""
+        self._held: NDArray[np.float32] | None = None  # the action of the last call
+        self._left = 0  # calls for which it is still held
         self._window: Window | None = None
 
     def __call__(self, observation: ArrayLike) -> NDArray[np.float32]:
         """The action (k,) at an observation (d,) in the units of the task's features, less offsets.
 
-        Several robots may be given at once, (n, d), for (n, k). A policy that was trained with a
-        history keeps it: give what the robot shows now.
+        Several robots may be given at once, (n, d), for (n, k), the same until `reset`. A policy
+        that was trained with a history keeps it: give what the robot shows now. What is refused
+        changes nothing: the next call goes on from the one before.
 
         Raises:
             InputError: observations of another size, or that aren't one array; or the action isn't
@@ -151,29 +158,58 @@ class Controller:
         self._held = self._act(self._seen(rows))
         return self._held.copy()
 
-    def _seen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The observation with its history, if the policy was trained with one."""
+    def _seen(self, observation: NDArray[np.float32]) -> _Seen:
+        """What follows from an observation; nothing is changed yet.
+
+        Raises:
+            InputError: it is of another size or number of robots, or not finite.
+        """
+        self._check(observation)
         if not self.task.view:
-            return observation
-        rows, shown = np.atleast_2d(observation), len(self.task.view.places)
-        if rows.shape[1] not in (shown, self.task.size):  # now, or with the history that it keeps
-            names = ", ".join(self.task.feature_names[:shown])
-            raise InputError(f"{rows.shape[1]} numbers observed: it takes {shown}, of {names}")
-        every = range(len(rows))
-        if self._window is None:
-            self._window = Window(self.task, len(rows), range(shown))
-            seen = self._window.begin(every, rows)
+            return _Seen(observation, None)
+        rows = np.atleast_2d(observation)
+        if self._window is None or self._held is None:
+            window = Window(self.task, len(rows), range(len(self.task.view.places)))
+            seen = window.begin(range(len(rows)), rows)
         else:
-            taken = np.atleast_2d(self._held)
-            seen = self._window.step(np.ones(len(rows), np.bool_), taken, rows)
-        return seen.reshape(*observation.shape[:-1], -1).astype(np.float32)
+            window, taken = self._window.copy(), np.atleast_2d(self._held)
+            seen = window.step(np.ones(len(rows), np.bool_), taken, rows)
+        return _Seen(seen.reshape(*observation.shape[:-1], -1).astype(np.float32), window)
+
+    def _check(self, observation: NDArray[np.float32]) -> None:
+        shape, view, size = observation.shape, self.task.view, self.task.size
+        names = self.task.feature_names[: len(view.places) if view else size]
+        # now, or with the history that it keeps
+        if len(shape) not in (1, 2) or shape[-1] not in (len(names), size):
+            raise InputError(
+                f"an observation of shape {shape}: the policy takes {len(names)} numbers, of "
+                f"{listed(names)}; or a row of them for each robot"
+            )
+        if self._held is not None and shape[:-1] != self._held.shape[:-1]:
+            before = *self._held.shape[:-1], shape[-1]
+            raise InputError(
+                f"an observation of shape {shape} after others of {before}: give the same robots, "
+                "or reset() the policy first"
+            )
+        finite = np.isfinite(observation[..., : len(names)])
+        if not finite.all():
+            name = names[int(np.argwhere(~finite)[0, -1])]
+            raise InputError(f"{name} is not finite: the policy takes finite numbers")
+
+    def _act(self, seen: _Seen) -> NDArray[np.float32]:
+        """The action that is held, or else chosen."""
+        action = self._held
+        if action is None or not self._left:
+            action, self._left = self._chosen(seen.observation), self.action_repeat
+        self._window, self._left = seen.window, self._left - 1
+        return action
 
     def _chosen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         if observation.ndim == 1 and not self._one_row:
             return self._chosen(observation[None])[0]
         action = self.acting.actions(self.encoder.encode(observation))
         if not np.isfinite(action).all():
-            raise InputError("the policy's action is not finite: is its observation?")
+            raise InputError("the policy's action is not finite: is its observation usual?")
         return action
 
 
