@@ -313,10 +313,11 @@ def test_the_provenance(entities, rollout):
     assert all(fact in told for fact in facts)
 
 
-def test_the_same_inputs_give_the_same_content(recorded, entities, folder):
-    def identity(path):
-        return RrdReader(path).recordings()[0].recording_id
+def identity(path):
+    return RrdReader(path).recordings()[0].recording_id
 
+
+def test_the_same_inputs_give_the_same_content(recorded, entities, folder):
     again = inspect(FACE, 1, encoder="dae-8", out=folder / "again.rrd")
     other = inspect(FACE, 1, out=folder / "other.rrd")
     assert identity(again) == identity(recorded) != identity(other)
@@ -630,6 +631,23 @@ def test_a_note_stands_in_the_provenance_and_is_told(folder, monkeypatch, rollou
     assert told == ["it differs here"]
     assert "- note: it differs here" in text(found["/provenance"])
     assert not any(path.startswith("/world") for path in found)
+
+
+def test_the_provenance_says_what_differs_and_only_what_is_known(folder):
+    task = describe("Pendulum-v1", max_episode_steps=30, domain={"delay": "1..2"})
+    rollout, found = find_episode("uniform", 4, task), []
+    turned, unknown = rollout.reward[::-1].copy(), np.full(30, np.nan, np.float32)
+    others = replace(rollout, reward=turned), replace(rollout, seed=-1, reward=unknown)
+    paths = [folder / f"domain-{i}.rrd" for i in range(3)]
+    for each, path in zip((rollout, *others), paths, strict=True):
+        record_episode(each, path)
+        found.append(read(path))
+        assert "- domain: `delay=1..2`" in text(found[-1]["/provenance"])
+    assert len({*map(identity, paths)}) == 3  # also where only the order of rewards differs
+    for entities, known in zip(found, (True, True, False), strict=True):
+        told = text(entities["/provenance"])
+        assert ("- seed: " in told, "- return: " in told) == (known, known)
+        assert ("/reward/total" in entities) == known
 
 
 def test_a_traversal_of_any_robot_shows_series(folder):

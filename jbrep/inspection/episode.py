@@ -37,7 +37,9 @@ def record_episode(
         InputError: the file can't be written.
     """
     task, motion = rollout.task, rollout.motion
-    content = (rollout.observation, rollout.action, *([motion.qpos] if motion else []))
+    content = [rollout.observation, rollout.action, rollout.reward]
+    if motion:
+        content.append(motion.qpos)
     if examples is None:
         examples = Examples([rollout.observation], [rollout.action], "this same episode")
     fan = make_fan(rollout, encoder, examples) if encoder else None
@@ -71,12 +73,14 @@ def provenance(rollout: Rollout, encoder: BaseEncoder | None, more: str = "") ->
     facts = {"task": rollout.task.name}
     if rollout.task.arguments:
         facts["arguments"] = f"`{', '.join(rollout.task.given_arguments)}`"
-    facts |= {
-        "seed": f"{rollout.seed}",
-        "steps": f"{len(rollout):,}",
-        "return": f"{rollout.episode_return:.1f}",
-        "end": "terminated" if rollout.terminated else "truncated",
-    }
+    if rollout.task.domain:
+        facts["domain"] = f"`{rollout.task.domain}`"
+    if rollout.seed >= 0:  # or else it isn't known
+        facts["seed"] = f"{rollout.seed}"
+    facts["steps"] = f"{len(rollout):,}"
+    if np.isfinite(rollout.reward).all():
+        facts["return"] = f"{rollout.episode_return:.1f}"
+    facts["end"] = "terminated" if rollout.terminated else "truncated"
     if rollout.note:
         facts["note"] = rollout.note
     if encoder:

@@ -60,7 +60,7 @@ def times_at(task: Task, steps: NDArray[np.int64]) -> list[rr.TimeColumn]:
 
 
 def send_signals(recording: Recording, rollout: Rollout) -> None:
-    """Send the observation of each state, the actions and the rewards."""
+    """Send the observation of each state, the actions, and the rewards if any are known."""
     task, states = rollout.task, np.arange(len(rollout) + 1)
     titles, times = [str(feature) for feature in task.features], times_at(task, states)
     send_features(recording, "observation", times, task, rollout.observation, titles)
@@ -69,8 +69,9 @@ def send_signals(recording: Recording, rollout: Rollout) -> None:
     names = [f"action_{i} [{low:g}, {high:g}]" for i, (low, high) in enumerate(bounds)]
     for name, place in numbered_panels("action", task.action_size).items():
         recording.send_series(name, acting, rollout.action[:, place], names[place])
-    total = rollout.reward[:, None]
-    recording.send_series("reward/total", times_at(task, states[1:]), total, ["reward"], [GREY])
+    if np.isfinite(rollout.reward).any():
+        total, led_to = rollout.reward[:, None], times_at(task, states[1:])
+        recording.send_series("reward/total", led_to, total, ["reward"], [GREY])
 
 
 def send_terms(recording: Recording, task: Task, motion: Motion) -> None:
