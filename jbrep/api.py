@@ -428,7 +428,7 @@ def _fitter(data: "Dataset | str | Path", out: str | Path, device: str) -> "Fitt
 
     scaled = ScaledDataset.of(data)
     for constant in scaled.constant_features:
-        _note(f"{constant} is constant in the training part: it is scaled to 0")
+        _note(f"{constant} is constant in the training part")
     return Fitter(scaled, Path(out), device)
 
 

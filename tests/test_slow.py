@@ -229,10 +229,15 @@ def test_features_that_depend_on_others_are_named(tmp_path):
 
 
 def test_a_constant_feature_passes_around_or_is_refused(tmp_path):
-    constant = system(tmp_path / "constant", extra=np.ones_like)
-    for kind in ("slow", "vamp", "linear-forward"):
-        with pytest.raises(InputError, match=r"is constant in .*: let it pass around"):
-            made(constant, kind, latent=2)
+    constant = system(tmp_path / "constant", extra=lambda rows: np.full((len(rows), 1), 0.7))
+    *_, name = constant.task.feature_names
+    ranges = [each.replace(low=-100.0, high=100.0) for each in constant.task.features]
+    constant.task = constant.task.replace(features=tuple(ranges))
+    for data in (constant, constant.rescaled("nominal"), constant.rescaled("standard")):
+        for kind in ("slow", "vamp", "linear-forward"):
+            with pytest.raises(InputError, match=f"{name} is constant in .*: let it pass around"):
+                made(data, kind, latent=2)
+    assert made(constant.rescaled("nominal", without=[name]), "slow", latent=2)
 
 
 def test_actions_that_follow_from_the_state_leave_vamp_nothing(tmp_path):

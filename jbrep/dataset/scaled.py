@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from jbrep.coordinates import Coordinates
 from jbrep.dataset.reader import Dataset
-from jbrep.dataset.scaling import EXTREMA, fit_scaler
+from jbrep.dataset.scaling import EXTREMA, NOMINAL, extrema, fit_scaler
 from jbrep.envs.task import Feature
 from jbrep.errors import InputError
 
@@ -40,6 +40,7 @@ class ScaledDataset:
         train: sorted rows of 80 % of the episodes.
         test: sorted rows of the others.
         scaler: fitted to the training rows only.
+        scaling: how, a key of jbrep.dataset.scaling.SCALINGS.
         used: places of the scaled numbers that a row has; all of them unless some are left out.
 
     Raises:
@@ -51,10 +52,11 @@ class ScaledDataset:
         self.task = dataset.task
         self.train, self.test = dataset.split()
         self.scaler = dataset.fit_scaler(self.train)
+        self.scaling = EXTREMA
         self.used = np.arange(self.scaler.size)
         unseen = dataset.fit_scaler(self.test)
-        extrema = (self.scaler.low, self.scaler.high, unseen.low, unseen.high)
-        not_finite = np.asarray(~np.isfinite(extrema).all(axis=0))
+        ends = (self.scaler.low, self.scaler.high, unseen.low, unseen.high)
+        not_finite = np.asarray(~np.isfinite(ends).all(axis=0))
         if not_finite.any():
             bad = ", ".join(self._names(not_finite))
             raise InputError(
@@ -91,8 +93,10 @@ class ScaledDataset:
             InputError: the task has no usual ranges, or no such feature.
         """
         other = copy(self)
-        other.__dict__.pop("moments", None)
+        for found in ("moments", "constant_features"):
+            other.__dict__.pop(found, None)
         column = self.dataset["observation"]
+        other.scaling = scaling
         other.scaler = fit_scaler(scaling, self.task, column, self.train, coordinates, clip)
         left_out = set(other.scaler.places(without, self.task))
         other.used = np.array([i for i in range(other.scaler.size) if i not in left_out], int)
@@ -117,10 +121,13 @@ class ScaledDataset:
         """The names of these."""
         return tuple(feature.name for feature in self.features)
 
-    @property
+    @cached_property
     def constant_features(self) -> tuple[str, ...]:
-        """Features that are constant over the training rows; they are scaled to 0."""
-        return self._names(self.scaler.low == self.scaler.high)
+        """Names of the numbers of a scaled row that are the same in all training rows."""
+        low, high = self.scaler.low[self.used], self.scaler.high[self.used]
+        if self.scaling == NOMINAL:  # the only one whose ranges aren't of these rows
+            low, high = extrema(self.chunks(self.train))
+        return self._names(low == high)
 
     @cached_property
     def reward_varies(self) -> bool:
@@ -148,8 +155,7 @@ class ScaledDataset:
         return math.ceil(math.log2(most)) if most else 0
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
-        names = [feature.name for feature in self.scaler.features(self.task)]
-        return tuple(np.array(names)[which].tolist())
+        return tuple(np.array(self.names)[which].tolist())
 
     def observations(self, rows: NDArray[np.int64]) -> Iterator[NDArray[np.float32]]:
         """Observations of the rows in physical units, in order, in chunks (n, d)."""

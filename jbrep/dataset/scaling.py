@@ -17,6 +17,7 @@ Rows = NDArray[np.int64]
 Range = tuple[NDArray[Any], NDArray[Any]]  # what becomes -1 and 1, (d,) each
 
 EXTREMA = "extrema"  # the paper's
+NOMINAL = "nominal"
 _DEVIATIONS = 3  # standard deviations that become 1
 _QUANTILES = (0.01, 0.5, 0.99)
 _SAMPLED = 500_000  # rows, for quantiles
@@ -198,7 +199,7 @@ def _robust(values: _Values, rows: Rows) -> Range:
 
 SCALINGS: dict[str, Callable[[_Values, Rows], Range]] = {
     EXTREMA: _extrema,  # minimum and maximum
-    "nominal": _nominal,  # the task's usual ranges
+    NOMINAL: _nominal,  # the task's usual ranges
     "standard": _standard,  # the mean, and three standard deviations to either side
     "robust": _robust,  # the median, and half the distance from the 1 % to the 99 % quantile
 }

@@ -140,7 +140,7 @@ class Directions(Coded, ClosedForm, frozen=True, kw_only=True):
 
     def check_data(self, data: ScaledDataset) -> None:
         """As for `Method`."""
-        if constant := [name for name in data.constant_features if name in data.names]:
+        if constant := data.constant_features:
             raise InputError(
                 f"{constant[0]} is constant in {data.dataset.folder}: let it pass around the "
                 f"encoder, with --keep {constant[0]}"
