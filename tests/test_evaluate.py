@@ -34,6 +34,7 @@ from jbrep.evaluate.readout import (
     probes,
 )
 from jbrep.evaluate.reconstruction import NOISES, corruption, reconstruction
+from jbrep.evaluate.regression import ridge
 from jbrep.evaluate.truth import quantities, state
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.controls import Random
@@ -382,6 +383,16 @@ def test_probes_are_ridge_regressions(held_out, coder):
         assert values[0] == pytest.approx(expected, rel=1e-3, abs=1e-3)
 
 
+def test_a_unit_that_is_rounding_where_a_regression_is_fitted_says_nothing():
+    values, noise = np.random.default_rng(0).normal(size=(2, 1000, 3)).astype(np.float32)
+    wanted, unseen = values + noise, values.copy()
+    unseen[:, 2] = 0.02 + 0.1
+    expected = ridge(values[:, :2], wanted)(unseen[:, :2])
+    for constant in (0, 0.1):
+        values[:, 2] = constant + 5e-9 * noise[:, 0]
+        np.testing.assert_allclose(ridge(values, wanted)(unseen), expected)
+
+
 def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     dataset = held_out.data.dataset
     parts, changes = [], []
@@ -412,8 +423,16 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     assert result.change[0] == pytest.approx(expected, abs=1e-3)
 
 
-def test_mixing_the_units_does_not_change_how_well_the_next_is_read(held_out, coder):
-    mixed = np.random.default_rng(0).normal(size=(4, 4)).astype(np.float32) * [[9], [1], [1], [0.1]]
+@pytest.mark.parametrize(
+    "mixed",
+    [
+        np.random.default_rng(0).normal(size=(4, 4)) * [[9], [1], [1], [0.1]],
+        np.diag([1e-4, 1, 1, 10]),
+        1e-7 * np.eye(4),
+    ],
+    ids=["mixed", "scaled", "tiny"],
+)
+def test_units_mixed_or_scaled_do_not_change_how_well_the_next_is_read(held_out, coder, mixed):
     (layer,) = coder.encoder
     weight, bias = ((mixed @ each).astype(np.float32) for each in (layer.weight, layer.bias))
     turned = (layer._replace(weight=weight, bias=bias),)

@@ -34,7 +34,7 @@ from jbrep.evaluate.held_out import (
     sample_rows,
 )
 from jbrep.evaluate.prediction import changes
-from jbrep.evaluate.regression import Predictor, Problem, ridge
+from jbrep.evaluate.regression import Predictor, Problem, ridge, varying
 from jbrep.evaluate.truth import Columns, quantities, quantities_and_features, state
 from jbrep.stats.bootstrap import Array, bootstrap, variation, without_nan
 
@@ -43,8 +43,7 @@ _CORRELATED = 50_000  # held-out rows
 _QUERIES = 5_000  # held-out rows whose neighbours are looked up
 _REFERENCES = 20_000  # training rows among which they are
 _NEIGHBOURS = 5
-_NEGLIGIBLE = 1e-6  # variance, as a share of the largest
-_ROUNDING = 1e-12  # variance that rounding alone can cause
+_NEGLIGIBLE = 1e-6  # variance of standardised units, as a share of the largest
 _UNIT_ROWS = 200_000  # held-out rows
 _POINTS = 4_000  # for intrinsic dimensions
 _SATURATED = 0.95  # magnitude of a tanh unit
@@ -216,16 +215,24 @@ def _steps(encoder: BaseEncoder, held_out: HeldOut, rows: Rows) -> _Steps:
 
 
 def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
-    """A map to uncorrelated directions of unit variance, leaving out constant ones.
+    """A map of latents (n, l) to uncorrelated directions of unit variance, without constant ones.
 
-    If all are constant, one direction is left, and it is 0.
+    Units are standardised first, so that their scales don't say which directions are constant. If
+    all are, one direction is left, and it is 0.
     """
-    mean = latents.mean(axis=0, dtype=np.float64)
-    variances, directions = np.linalg.eigh(np.cov(latents.T).reshape(len(mean), -1))
-    kept = variances > max(_NEGLIGIBLE * variances[-1], _ROUNDING)
-    scales = np.where(kept, 1 / np.sqrt(np.where(kept, variances, 1)), 0)
+    mean, deviation = (getattr(latents, of)(axis=0, dtype=np.float64) for of in ("mean", "std"))
+    factor = _inverse(deviation, varying(latents))
+    standardised = (latents - mean) * factor
+    variances, directions = np.linalg.eigh(np.cov(standardised.T).reshape(len(mean), -1))
+    kept = variances > _NEGLIGIBLE * variances[-1]
+    scales = _inverse(np.sqrt(np.maximum(variances, 0)), kept)
     matrix = (directions * scales)[:, kept | (np.arange(len(kept)) == len(kept) - 1)]
-    return lambda values: (values - mean) @ matrix
+    return lambda values: (values - mean) * factor @ matrix
+
+
+def _inverse(values: Array, kept: NDArray[np.bool_]) -> Array:
+    """1 / values of those that are kept, 0 of the others, (n,)."""
+    return np.divide(1, values, out=np.zeros(len(values)), where=kept)
 
 
 def neighbours(encoder: BaseEncoder, held_out: HeldOut) -> Neighbours:
