@@ -4,6 +4,7 @@ import json
 import re
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -13,6 +14,7 @@ from sklearn.decomposition import PCA
 from sklearn.linear_model import Ridge
 from sklearn.metrics import r2_score
 from sklearn.preprocessing import StandardScaler
+from threadpoolctl import threadpool_limits
 from wide import make_feature, make_task, wide
 
 from jbrep.dataset import ScaledDataset, Scaler
@@ -453,6 +455,17 @@ def test_neighbours_come_from_training_episodes(held_out, coder, everything):
     assert result.mse[0] == pytest.approx(expected, rel=1e-2)
     assert np.mean([v[0] for v in result.dimensions.values()]) == pytest.approx(result.mse[0])
     assert neighbours(everything, held_out).mse[0] < result.mse[0]
+
+
+def test_neighbours_that_are_equally_near_are_the_same_on_any_number_of_threads(data, monkeypatch):
+    signs = SimpleNamespace(encode=lambda rows: np.sign(rows).astype(np.float32))
+    encoder, held_out = find(signs, data.task), HeldOut(data)
+    monkeypatch.setenv("OMP_NUM_THREADS", "8")  # or no more are taken than there are cores
+    found = []
+    for threads in (1, 8):
+        with threadpool_limits(threads, "openmp"):
+            found.append(neighbours(encoder, held_out).mse)
+    assert found[0] == found[1]
 
 
 def test_correlation_takes_units_alone_as_candidates(held_out, coder, everything):

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
@@ -257,15 +258,17 @@ def neighbours(encoder: BaseEncoder, held_out: HeldOut) -> Neighbours:
         np.stack(list(state(data.task, rows).values()), 1) for rows in (queries, references)
     )
     scale = reference_states.std(axis=0)
-    varying = np.ptp(reference_states, axis=0) > 0
+    varies = np.ptp(reference_states, axis=0) > 0
     index = NearestNeighbors(n_neighbors=min(_NEIGHBOURS, len(train)))
     index.fit(encoder.encode(references))
-    nearest = index.kneighbors(encoder.encode(queries), return_distance=False)
-    differences = (reference_states[nearest] - query_states[:, None])[..., varying] / scale[varying]
+    latents = encoder.encode(queries)
+    with threadpool_limits(1, "openmp"):  # of this thread: which of equally near ones depends on it
+        nearest = index.kneighbors(latents, return_distance=False)
+    differences = (reference_states[nearest] - query_states[:, None])[..., varies] / scale[varies]
     squares = np.square(differences).mean(axis=1)
     sums, counts = held_out.sums(test, squares, np.ones((len(test), 1)))
     by_name = scores(bootstrap(lambda s, n: s / n, sums, counts))
-    names = np.array(list(state(data.task, references[:1])))[varying].tolist()
+    names = np.array(list(state(data.task, references[:1])))[varies].tolist()
     return Neighbours(
         mse=score(bootstrap(lambda s, n: s.mean(axis=-1) / n[..., 0], sums, counts)),
         dimensions=dict(zip(names, by_name, strict=True)),
