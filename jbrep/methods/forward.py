@@ -66,8 +66,10 @@ class Forward(Network, Learned, frozen=True, kw_only=True):
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
         """As for `Method`."""
         steps, lost = max(metrics["loss_by_horizon"].items(), key=lambda each: int(each[0]))
-        parts = [part for part in ("changes", "reward") if part in lost]
-        told = " and ".join(f"{1 - lost[part]:.2f} of the {part}" for part in parts) or "nothing"
+        known = [part for part in ("changes", "reward") if part in lost] or list(lost)
+        if not known:  # only the action was to be told
+            return ""
+        told = " and ".join(f"{1 - lost[part]:.2f} of the {part}" for part in known)
         what = "1 - error / variance in the training part"
         return f"predicts {told} over {steps} held-out steps ({what})"
 
