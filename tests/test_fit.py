@@ -299,7 +299,7 @@ def test_constant_huge_and_tiny_features_give_finite_encoders(kind, tmp_path):
 
 def test_observations_that_cannot_be_reduced_are_refused(tmp_path):
     single = Fitter(wide([20] * 5, features=1), tmp_path)
-    with pytest.raises(InputError, match="Humanoid-v5 has 1 feature to reduce, too few: use"):
+    with pytest.raises(InputError, match="Humanoid-v5 has 1 feature to encode, too few: use"):
         single.fit("dae", latent=1)
     assert single.fit("full", **how("full")).encoder.latent_size == 1
     data = wide([20] * 5)
@@ -390,9 +390,10 @@ def test_rows_so_far_apart_that_too_few_pairs_are_left_are_refused(
         Fitter(data, tmp_path).fit(kind, latent=4, **{far: (999,)})
 
 
-def test_keeping_everything_leaves_nothing_to_reduce(data, tmp_path):
-    with pytest.raises(InputError, match="no feature to reduce beside what is kept, too few: use"):
-        Fitter(data, tmp_path).fit("pca", latent=4, keep=("*",))
+@pytest.mark.parametrize("kind", ["pca", "dae", "fourier", "ofe"])
+def test_keeping_everything_leaves_nothing_to_encode(kind, data, tmp_path):
+    with pytest.raises(InputError, match="no feature to encode beside what is kept, too few: use"):
+        Fitter(data, tmp_path).fit(kind, latent=8, keep=("*",))
 
 
 def test_the_header_has_the_batch_size_that_was_chosen(data, tmp_path):

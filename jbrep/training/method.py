@@ -152,10 +152,10 @@ class Coded(Method, frozen=True, kw_only=True):
     def check_data(self, data: ScaledDataset) -> None:
         """As for `Method`."""
         largest = self.largest(data.size)
-        if largest is not None and largest < 1:
+        if not data.size or (largest is not None and largest < 1):
             beside = " beside what is kept" if self.keep else ""
             raise InputError(
-                f"{data.task.name} has {data.size or 'no'} feature to reduce{beside}, too few: use "
+                f"{data.task.name} has {data.size or 'no'} feature to encode{beside}, too few: use "
                 f"{FULL}"
             )
         if largest is not None and self.latent > largest:
