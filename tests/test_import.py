@@ -688,6 +688,17 @@ def test_the_command(tmp_path):
     assert done.stderr == f"Error: {out} exists already: choose another name\n"
 
 
+def test_ctrl_c_while_a_source_is_opened_ends_it_in_a_line(tmp_path, monkeypatch):
+    def stop(given):
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("it went on")
+
+    monkeypatch.setattr("jbrep.dataset.formats.npz.open_source", stop)
+    d4rl(tmp_path / "a.npz")
+    told = jbrep("data", "import", tmp_path / "a.npz", "--out", tmp_path / "out")
+    assert (told.exit_code, told.stderr) == (130, "stopped; nothing was imported\n")
+
+
 def test_an_end_must_be_true_or_false(tmp_path):
     flat = {
         "observations": np.zeros((6, 2), np.float32),

@@ -276,7 +276,7 @@ def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
     is made from the data alone. See docs/logs.md, and docs/data-format.md for what is known by its
     name.
     """
-    from jbrep.dataset.formats import open_sources
+    from jbrep.dataset.formats import load_reader, open_sources
     from jbrep.dataset.formats.writer import write
     from jbrep.envs.names import import_code, is_code
 
@@ -294,8 +294,10 @@ def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
     task = given_task(options)
     with stoppable("nothing was imported"):
         with deferred_stop():
-            missing = told["missing"] or (task.missing if task else "") or ""
-            opened = open_sources(source, layout, missing)
+            for each in source:
+                load_reader(each)
+        missing = told["missing"] or (task.missing if task else "") or ""
+        opened = open_sources(source, layout, missing)
         said = {} if task else _given(told)
         manifest = write(opened, out, task, **said, reward=reward)
     for note in opened.notes:

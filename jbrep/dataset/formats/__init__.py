@@ -117,6 +117,24 @@ def open_source(given: str, layout: Layout | None = None, missing: str = "") -> 
         InputError: there is nothing of the kind, or it can't be read.
         ModuleNotFoundError: its format needs a package that isn't installed.
     """
+    module = load_reader(given)
+    if hasattr(module, "open_table"):
+        from jbrep.dataset.formats.logs import source_of_table
+
+        return source_of_table(module.open_table(given), layout, missing)
+    if layout not in (None, Layout()):
+        raise InputError(f"{given} names its arrays itself: only a table's columns can be named")
+    opened: Source = module.open_source(given)
+    return opened
+
+
+def load_reader(given: str) -> ModuleType:
+    """Import what reads a file or folder, without opening it.
+
+    Raises:
+        InputError: there is nothing of the kind.
+        ModuleNotFoundError: its format needs a package that isn't installed.
+    """
     path = Path(given)
     suffix = path.suffix.removeprefix(".").lower()
     is_file = exists(path) and not path.is_dir()
@@ -132,13 +150,8 @@ def open_source(given: str, layout: Layout | None = None, missing: str = "") -> 
     name = _FILES[suffix] if is_file else next(folders, "minari")
     module = import_module(f"{__name__}.{name}")
     if hasattr(module, "open_table"):
-        from jbrep.dataset.formats.logs import source_of_table  # imports pyarrow
-
-        return source_of_table(module.open_table(given), layout, missing)
-    if layout not in (None, Layout()):
-        raise InputError(f"{given} names its arrays itself: only a table's columns can be named")
-    opened: Source = module.open_source(given)
-    return opened
+        import_module(f"{__name__}.logs")  # imports pyarrow
+    return module
 
 
 def together(sources: Sequence[Source]) -> Source:
