@@ -3,10 +3,13 @@
 import hashlib
 import json
 import math
+import os
 import re
 import shlex
 import shutil
+import sqlite3
 import sys
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -603,6 +606,63 @@ def test_a_damaged_bag_is_refused(tmp_path):
         assert f"{name} can't be read as a bag" in done.stderr
 
 
+def test_a_bag_reads_nothing_outside_itself_and_opens_no_pipe(tmp_path):
+    path, out = write_bag(tmp_path / "walk", "db3"), tmp_path / "out"
+    about, database = path / "metadata.yaml", path / "walk.db3"
+    elsewhere = path / "..%2Felsewhere.db3"  # which SQLite takes for ../elsewhere.db3
+    shutil.copy(database, tmp_path / "elsewhere.db3")
+    elsewhere.touch()
+    said = about.read_text()
+    about.write_text(said.replace("walk.db3", elsewhere.name))
+    assert "can't be opened with any of %?# in it: rename it" in mistake(
+        "data", "import", path, "--out", out
+    )
+    about.write_text(said)
+    elsewhere.unlink()
+    for make in (lambda: database.symlink_to(tmp_path / "elsewhere.db3"), lambda: os.mkfifo(about)):
+        for each in (database, about):
+            each.unlink(missing_ok=True)
+        make()
+        about.exists() or about.write_text(said)
+        assert "must be a plain file: no link, pipe or" in mistake(
+            "data", "import", path, "--out", out
+        )
+
+
+@pytest.mark.parametrize(
+    ("told", "made"),
+    [
+        (
+            "has the view schema",
+            "DROP TABLE schema; CREATE VIEW schema AS WITH RECURSIVE c(x) AS "
+            "(SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT max(x) AS schema_version FROM c",
+        ),
+        (
+            "has the computed column data",
+            "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, "
+            "timestamp, data AS (zeroblob(1000000000)))",
+        ),
+    ],
+)
+@pytest.mark.parametrize("is_squeezed", [False, True])
+def test_a_bag_with_a_database_that_computes_is_refused(told, made, is_squeezed, tmp_path):
+    path = write_bag(tmp_path / "walk", "db3")
+    database = path / "walk.db3"
+    with closing(sqlite3.connect(database)) as opened:
+        opened.executescript(made)
+    if is_squeezed:
+        squeezed = pa.compress(database.read_bytes(), "zstd", asbytes=True)
+        (path / "walk.db3.zstd").write_bytes(squeezed)
+        about = (path / "metadata.yaml").read_text()
+        about = about.replace("walk.db3", "walk.db3.zstd")
+        about = about.replace("compression_format: ''", "compression_format: zstd")
+        about = about.replace("compression_mode: ''", "compression_mode: file")
+        (path / "metadata.yaml").write_text(about)
+    assert f"{told}: a bag has plain tables only" in mistake(
+        "data", "import", path, "--out", tmp_path / "out"
+    )
+
+
 def test_the_page_on_logs_does_what_it_says(tmp_path, monkeypatch):
     """Its first block of Python writes a log, its commands import it."""
     page = (Path(__file__).parent.parent / "docs/logs.md").read_text().partition("\n## ")[0]
@@ -916,7 +976,7 @@ def test_no_link_in_a_lerobot_data_set_is_followed(tmp_path):
     shutil.move(folder / "data/chunk-000", tmp_path / "elsewhere")
     (folder / "data/chunk-000").symlink_to(tmp_path / "elsewhere")
     said = mistake("data", "import", folder, "--out", tmp_path / "no")
-    assert "chunk-000 is a link, which isn't followed there" in said
+    assert "chunk-000 must be a plain file: no link" in said
 
 
 def test_a_column_too_wide_to_be_used_is_left_out(tmp_path):

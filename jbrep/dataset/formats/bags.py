@@ -3,8 +3,9 @@
 Each message is a row that has the numbers of its topic only, at the time when it was recorded.
 """
 
+import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_typestore
 
 from jbrep.dataset.formats.episodes import digits_lost, label
@@ -19,12 +21,19 @@ from jbrep.dataset.formats.flat import CHUNK
 from jbrep.dataset.formats.tables import Table
 from jbrep.dataset.layout import Layout
 from jbrep.envs.task import MAX_FEATURES
-from jbrep.errors import refusing
+from jbrep.errors import InputError, refusing
 from jbrep.records.record import MOST_WHOLE
+from jbrep.records.storage import check_plain
 
 _TIME = "time"
 _DEEPEST = 8  # messages in messages
 _PEEKED = 200  # messages of a topic by which its numbers are known
+_OF_ADDRESSES = "%?#"  # what SQLite takes for other characters, as rosbags gives it a path
+_COMPUTED = """
+SELECT type || ' ' || name FROM pragma_table_list WHERE type != 'table' UNION ALL
+SELECT 'computed column ' || c.name FROM pragma_table_list AS t, pragma_table_xinfo(t.name) AS c
+WHERE t.type = 'table' AND c.hidden
+"""  # which takes what time and memory it likes
 
 
 class _Message(NamedTuple):
@@ -44,9 +53,10 @@ def open_table(given: str) -> Table:
     """Open a .bag of ROS 1, an .mcap or .db3, or the folder of a bag of ROS 2.
 
     Raises:
-        InputError: it can't be read.
+        InputError: it can't be read, or its folder has a link or a pipe.
     """
     path, columns, unknown, late = Path(given), list[str](), list[str](), dict[str, str]()
+    check_plain(path)
     with _opened(path) as reader:
         for topic in sorted(reader.topics):
             messages = islice(_messages(reader, {topic}), _PEEKED)
@@ -65,6 +75,27 @@ def open_table(given: str) -> Table:
         is_sparse=True,
         notes=(f"no numbers known in {', '.join(unknown)}",) if unknown else (),
     )
+
+
+_open_storage = Sqlite3Reader.open
+
+
+def _open_checked(storage: Sqlite3Reader) -> None:
+    """Open a database that has nothing but plain tables.
+
+    Raises:
+        InputError: it has others, or SQLite would open another file.
+    """
+    path = Path(str(storage.path))
+    if any(each in str(path) for each in _OF_ADDRESSES):
+        raise InputError(f"{path} can't be opened with any of {_OF_ADDRESSES} in it: rename it")
+    with closing(sqlite3.connect(f"file:{path}?immutable=1", uri=True)) as database:
+        if computed := database.execute(_COMPUTED).fetchone():
+            raise InputError(f"{path} has the {computed[0]}: a bag has plain tables only")
+    _open_storage(storage)
+
+
+Sqlite3Reader.open = _open_checked  # type: ignore[assignment]  # also of what is in a folder
 
 
 @contextmanager

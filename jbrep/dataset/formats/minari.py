@@ -9,7 +9,6 @@ import hashlib
 import json
 import os
 import re
-import stat
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -41,6 +40,7 @@ from jbrep.progress import Progress
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Finite, Sha256
 from jbrep.records.storage import (
+    check_plain,
     exists,
     inside,
     make_folder,
@@ -132,16 +132,14 @@ def _folder(given: str) -> Path:
 
 
 def _check_files(folder: Path) -> Checksums | None:
-    """Make sure that all files are plain ones inside the folder, and as jbrep exported them, if so.
+    """Make sure that all files are inside the folder, and as jbrep exported them, if so.
 
     Raises:
-        InputError: one isn't, or leads out of the folder, or holds more than it has bytes for.
+        InputError: one is no plain file, leads out of the folder, or holds more than it has bytes
+            for.
         DamageError: one isn't what was exported.
     """
-    for path in sorted(folder.rglob("*")):
-        kind = path.lstat().st_mode
-        if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-            raise InputError(f"{path} must be a plain file: no link, pipe or device is opened")
+    check_plain(folder)
     known = read_document(folder / _CHECKSUMS, Checksums) if exists(folder / _CHECKSUMS) else None
     if known:
         for name, sha256 in known.files.items():
