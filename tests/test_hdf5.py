@@ -1,5 +1,7 @@
 """HDF5 files of others: D4RL's layout and robomimic's, as their own tools write them."""
 
+import zlib
+
 import h5py
 import numpy as np
 import pytest
@@ -165,6 +167,41 @@ def test_what_is_no_hdf5_is_refused(tmp_path):
     for damaged in (b"nonsense" * 50, content[: len(content) // 2]):
         path.write_bytes(damaged)
         check_refused(path, "a.hdf5 can't be read as an HDF5 file")
+
+
+def squeezed(content, times):
+    for _ in range(times):
+        content = zlib.compress(content)
+    return content
+
+
+@pytest.mark.parametrize(
+    ("times", "problem"),
+    [
+        (1, " bytes for a chunk of 200"),
+        (2, "observations has filters other than deflate or lzf, once, and shuffle and fletcher"),
+    ],
+)
+def test_a_chunk_holds_no_more_than_it_says(times, problem, tmp_path):
+    path = write_d4rl(tmp_path / "a.hdf5", observations=None)
+    settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    settings.set_chunk((ROWS, 2))
+    for _ in range(times):
+        settings.set_deflate(9)
+    with h5py.File(path, "r+") as file:
+        space = h5py.h5s.create_simple((ROWS, 2))
+        array = h5py.h5d.create(file.id, b"observations", h5py.h5t.NATIVE_FLOAT, space, settings)
+        array.write_direct_chunk((0, 0), squeezed(bytes(10_000_000), times))
+    check_refused(path, problem)
+
+
+def test_a_file_may_be_squeezed_and_shuffled(tmp_path):
+    path = write_d4rl(tmp_path / "a.hdf5")
+    with h5py.File(path, "r+") as file:
+        for name, by in (("observations", "gzip"), ("rewards", "lzf")):
+            values = file.pop(name)[:]
+            file.create_dataset(name, data=values, compression=by, shuffle=True, fletcher32=True)
+    assert imported(path)[1].episodes["length"].tolist() == [9, 7, 6]
 
 
 def check_refused(path, problem):

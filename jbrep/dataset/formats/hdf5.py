@@ -32,7 +32,9 @@ from jbrep.text import counted
 Array = NDArray[Any]
 
 _MOST_AT_ONCE = 1 << 30  # bytes of an array
-_SQUEEZED = 2000  # times that HDF5's filters may make an array smaller, at most
+_SQUEEZED = 2000  # times that one of HDF5's filters may make an array smaller, at most
+_SQUEEZING = {"deflate": h5py.h5z.FILTER_DEFLATE, "lzf": h5py.h5z.FILTER_LZF}
+_OF_ONE_SIZE = {"shuffle": h5py.h5z.FILTER_SHUFFLE, "fletcher32": h5py.h5z.FILTER_FLETCHER32}
 _IMAGE_AXES = 4  # steps, height, width, colour
 _NOW, _NEXT = "obs/", "next_obs/"
 _ROWS = ("actions", "rewards", "dones")
@@ -67,12 +69,34 @@ def _problem(file: h5py.File, whole: bool, name: str, link: Any) -> str | None:
         return f"{name} is in another file, which isn't opened"
     stored, size = found.id.get_storage_size(), found.nbytes
     at_once = size if whole else math.prod(found.chunks or (0,)) * found.dtype.itemsize
-    if size <= _SQUEEZED * (stored + 1) and at_once <= _MOST_AT_ONCE:
-        return None
-    return (
-        f"{name} would have {size:,} bytes, of which {stored:,} are stored: at most "
-        f"{_MOST_AT_ONCE:,} are possible, and what is stored"
+    if size > _SQUEEZED * (stored + 1) or at_once > _MOST_AT_ONCE:
+        return (
+            f"{name} would have {size:,} bytes, of which {stored:,} are stored: at most "
+            f"{_MOST_AT_ONCE:,} are possible, and what is stored"
+        )
+    return _problem_of_chunks(name, found) if found.chunks else None
+
+
+def _problem_of_chunks(name: str, array: h5py.Dataset) -> str | None:
+    """Why an array's chunks aren't read: far more could come out of them than they are to hold."""
+    settings, squeezing = array.id.get_create_plist(), {*_SQUEEZING.values()}
+    filters = [settings.get_filter(i)[0] for i in range(settings.get_nfilters())]
+    may_be = squeezing | {*_OF_ONE_SIZE.values()}
+    if not may_be >= {*filters} or len({*filters}) < len(filters) or squeezing <= {*filters}:
+        return (
+            f"{name} has filters other than {' or '.join(_SQUEEZING)}, once, and "
+            f"{' and '.join(_OF_ONE_SIZE)}: write it again with these"
+        )
+    size = math.prod(array.chunks) * array.dtype.itemsize
+    most = 2 * size + 4096  # what can't be squeezed grows a little
+    found: str | None = array.id.chunk_iter(
+        lambda chunk: (
+            f"{name} has {chunk.size:,} bytes for a chunk of {size:,}"
+            if chunk.size > most
+            else None
+        )
     )
+    return found
 
 
 class _Part(NamedTuple):
