@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tracemalloc
 import warnings
 import zipfile
 from pathlib import Path
@@ -571,6 +572,35 @@ def test_a_minari_data_set_has_plain_files_and_harmless_arguments(minari_folder,
     metadata.write_text(json.dumps({**known, "total_episodes": "many"}))
     with pytest.raises(InputError, match="can't be read as a Minari data set"):
         import_data(str(folder), tmp_path / "data")
+
+
+def test_a_changed_name_in_what_was_exported_to_npz_is_noticed(written, tmp_path):
+    """The list of members in a zip file has no checksum."""
+    export(written, "npz", tmp_path / "a.npz")
+    content, changed = (tmp_path / "a.npz").read_bytes(), list[bytes]()
+    places = [found.start() for found in re.finditer(rb"PK(\x01\x02|\x05\x06|\x06\x06)", content)]
+    for first, second, third in zip(places, places[1:], places[2:], strict=False):
+        hidden = (third - second).to_bytes(2, "little")  # in a comment on the one before
+        changed.append(content[: first + 32] + hidden + content[first + 34 :])
+    for name in re.findall(rb"PK\x01\x02.{42}([\w/]+)\.npy", content, re.DOTALL):
+        other = content[places[0] :].replace(name + b".npy", name + b".npx")
+        changed.append(content[: places[0]] + other)
+    for each in changed:
+        (tmp_path / "b.npz").write_bytes(each)
+        with pytest.raises(InputError, match=r"b\.npz (has '.*\.npx'|is damaged: it isn't what)"):
+            open_source(str(tmp_path / "b.npz"))
+    assert len(changed) > 20
+
+
+def test_a_header_in_an_npz_file_takes_no_memory(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        header = b"\x93NUMPY\x02\x00" + (30_000_000).to_bytes(4, "little")
+        archive.writestr("observations.npy", header + b" " * 30_000_000)
+    tracemalloc.start()
+    with pytest.raises(InputError, match="is damaged: observations isn't an array"):
+        open_source(str(tmp_path / "a.npz"))
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
 
 
 class Evil:

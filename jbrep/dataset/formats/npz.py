@@ -1,5 +1,7 @@
 """One npz file: arrays as Gymnasium's users name them, or all columns as jbrep writes them."""
 
+import hashlib
+import io
 import math
 import zipfile
 import zlib
@@ -15,7 +17,7 @@ from jbrep.dataset.formats.episodes import Rows, Source, check_arrays, check_nam
 from jbrep.dataset.formats.flat import CHUNK, own_names, per_episode, split
 from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Feature
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError, refusing
 from jbrep.progress import Progress
 from jbrep.records.storage import publish_file, unfinished
 from jbrep.text import words
@@ -23,12 +25,15 @@ from jbrep.text import words
 Array = NDArray[Any]
 EPISODE_BYTES = 0  # besides its rows
 _SUFFIX = ".npy"
+_MOST_HEADER = 10_000  # bytes, which is NumPy's own limit
 _MOST_AT_ONCE = 1 << 30  # bytes of an array, which zeros can be squeezed into a thousandth of
 _MOST_WORDS = 1 << 22  # likewise, of names
 _DAMAGE = (  # what zipfile and NumPy raise at damaged files, and encrypted ones
     *(ValueError, TypeError, KeyError, OSError, EOFError, RuntimeError),
     *(NotImplementedError, zipfile.BadZipFile, zlib.error),
 )
+_SHA256 = "sha256"  # of what jbrep writes: the name and the SHA-256 of each other member, (n, 2)
+_EPISODES = "episodes/"  # which only jbrep writes, too
 _OFFSETS = "feature_offsets"  # which only jbrep writes: subtracted from observations, (d,)
 _ONCE = {  # what is known once for each episode
     "final_observation": ("episodes/final_observation", "final_observations"),
@@ -62,11 +67,15 @@ def _opened(archive: zipfile.ZipFile, name: str) -> Iterator[_Stored]:
     """
     try:
         with archive.open(f"{name}{_SUFFIX}") as file:
-            read = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
+            width, read = {
+                (1, 0): (2, np.lib.format.read_array_header_1_0),
+                (2, 0): (4, np.lib.format.read_array_header_2_0),
             }[np.lib.format.read_magic(file)]
-            shape, by_columns, dtype = read(file)
+            length = file.read(width)
+            if int.from_bytes(length, "little") > _MOST_HEADER:  # NumPy would read it before
+                raise ValueError
+            header = length + file.read(int.from_bytes(length, "little"))
+            shape, by_columns, dtype = read(io.BytesIO(header))
             if dtype.hasobject:
                 raise InputError(
                     f"{archive.filename} has objects in {name}, which would have to be unpickled, "
@@ -90,14 +99,17 @@ def open_source(given: str) -> Source:
 
     Raises:
         InputError: it isn't one, or can't be used; nothing in it is unpickled.
+        DamageError: it isn't what jbrep exported.
     """
     path, stored = Path(given), dict[str, _Stored]()
     with _archive(path) as archive:
         for member in archive.namelist():
-            if member.endswith(_SUFFIX):
-                name = member.removesuffix(_SUFFIX)
-                with _opened(archive, name) as stored[name]:
-                    pass
+            if not member.endswith(_SUFFIX):
+                raise InputError(f"{path} has {member!r}, which must be an array: *{_SUFFIX}")
+            name = member.removesuffix(_SUFFIX)
+            with _opened(archive, name) as stored[name]:
+                pass
+        _check_exported(archive, stored)
         own = own_names(given, stored)
         check_names(given, own)
         check_arrays(given, {column: stored[name] for column, name in own.items()})
@@ -113,6 +125,37 @@ def open_source(given: str) -> Source:
         has_rewards="reward" in own,
         subtracted=offsets,
     )
+
+
+def _check_exported(archive: zipfile.ZipFile, names: Collection[str]) -> None:
+    """Make sure that what jbrep exported is what it was; a zip file's names have no checksum.
+
+    Raises:
+        DamageError: it isn't.
+    """
+    if _SHA256 not in names and not any(name.startswith(_EPISODES) for name in names):
+        return
+    known = _whole(archive, _SHA256, _MOST_WORDS).tolist() if _SHA256 in names else []
+    if known != _sha256(archive):
+        raise DamageError(
+            f"{archive.filename} is damaged: it isn't what was exported, by its checksums; export "
+            "the data set again"
+        )
+
+
+def _sha256(archive: zipfile.ZipFile) -> list[list[str]]:
+    """The name and the SHA-256 of each member, in the order of names.
+
+    Raises:
+        DamageError: one can't be read.
+    """
+    sums = list[list[str]]()
+    for member in sorted({*archive.namelist()} - {f"{_SHA256}{_SUFFIX}"}):
+        told = f"{archive.filename} is damaged: {member} can't be read"
+        with refusing(told, _DAMAGE, kind=DamageError), archive.open(member) as file:
+            digest = hashlib.file_digest(file, "sha256")  # type: ignore[arg-type]  # of IO[bytes]
+            sums.append([member, digest.hexdigest()])
+    return sums
 
 
 def _archive(path: Path) -> zipfile.ZipFile:
@@ -208,18 +251,23 @@ def write(dataset: Dataset, out: Path) -> str:
 
 
 def _write_zip(dataset: Dataset, path: Path, name: str) -> None:
-    arrays = {f"episodes/{name}": values for name, values in dataset.episodes.items()}
+    arrays = {f"{_EPISODES}{name}": values for name, values in dataset.episodes.items()}
     arrays["feature_names"] = np.array(dataset.task.feature_names)
     arrays["feature_units"] = np.array([feature.unit for feature in dataset.task.features])
     arrays[_OFFSETS] = dataset.task.offset
     with zipfile.ZipFile(path, "w", allowZip64=True) as archive:
         for column_name in Progress(dataset.columns, unit="column", desc=name):
             column = dataset[column_name]
-            with archive.open(f"{column_name}.npy", "w", force_zip64=True) as file:
+            with archive.open(f"{column_name}{_SUFFIX}", "w", force_zip64=True) as file:
                 header = {"descr": column.dtype.str, "fortran_order": False, "shape": column.shape}
                 np.lib.format.write_array_header_1_0(file, header)
                 for chunk in column.chunks():
                     file.write(np.ascontiguousarray(chunk).data)
         for array_name, values in arrays.items():
-            with archive.open(f"{array_name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, values, allow_pickle=False)
+            _write_array(archive, array_name, values)
+        _write_array(archive, _SHA256, np.array(_sha256(archive)))
+
+
+def _write_array(archive: zipfile.ZipFile, name: str, values: Array) -> None:
+    with archive.open(f"{name}{_SUFFIX}", "w", force_zip64=True) as file:
+        np.lib.format.write_array(file, values, allow_pickle=False)
