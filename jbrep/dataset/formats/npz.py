@@ -256,6 +256,8 @@ def _write_zip(dataset: Dataset, path: Path, name: str) -> None:
     arrays["feature_units"] = np.array([feature.unit for feature in dataset.task.features])
     arrays[_OFFSETS] = dataset.task.offset
     with zipfile.ZipFile(path, "w", allowZip64=True) as archive:
+        for array_name, values in arrays.items():  # first: they say that there are checksums
+            _write_array(archive, array_name, values)
         for column_name in Progress(dataset.columns, unit="column", desc=name):
             column = dataset[column_name]
             with archive.open(f"{column_name}{_SUFFIX}", "w", force_zip64=True) as file:
@@ -263,8 +265,6 @@ def _write_zip(dataset: Dataset, path: Path, name: str) -> None:
                 np.lib.format.write_array_header_1_0(file, header)
                 for chunk in column.chunks():
                     file.write(np.ascontiguousarray(chunk).data)
-        for array_name, values in arrays.items():
-            _write_array(archive, array_name, values)
         _write_array(archive, _SHA256, np.array(_sha256(archive)))
 
 
