@@ -22,6 +22,8 @@ import pyarrow.parquet as pq
 import pytest
 from command import jbrep, mistake
 from foreign import GYRO, PITCH, RATE, TIMES, VOLTS, csv_rows, lerobot_folder, write_bag, write_csv
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from small import flip_bit
 
 from jbrep.collect import collect
@@ -660,6 +662,19 @@ def test_a_bag_with_a_database_that_computes_is_refused(told, made, is_squeezed,
         (path / "metadata.yaml").write_text(about)
     assert f"{told}: a bag has plain tables only" in mistake(
         "data", "import", path, "--out", tmp_path / "out"
+    )
+
+
+@pytest.mark.parametrize("field", ["string[5000] data", "std_msgs/Float64[5000] data"])
+def test_a_message_of_very_many_parts_is_refused(field, tmp_path):
+    """For which rosbags would write code for minutes."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(f"{field}\n", "my_msgs/msg/Long"))
+    with Writer(tmp_path / "walk", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection("/long", "my_msgs/msg/Long", typestore=store)
+        writer.write(topic, 0, b"\0\1\0\0")
+    assert "has messages my_msgs/msg/Long of more than 4,096 parts" in mistake(
+        "data", "import", tmp_path / "walk", "--out", tmp_path / "out"
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -104,7 +105,20 @@ def _opened(path: Path) -> Iterator[AnyReader]:
     with refusing(f"{path} can't be read as a bag"):  # whatever damaged bags raise
         store = get_typestore(Stores.ROS2_HUMBLE)
         with AnyReader([path], default_typestore=store) as reader:
+            for name, (_, fields) in reader.typestore.fielddefs.items():
+                if sum(map(_parts, fields)) > MAX_FEATURES:
+                    has = f"{path} has messages {name} of more than {MAX_FEATURES:,} parts"
+                    raise InputError(f"{has}: record it without them")
             yield reader
+
+
+def _parts(field: tuple[str, Any]) -> int:
+    """How many parts of a message rosbags makes code for, of a field: arrays of numbers are one."""
+    kind, of = field[1]
+    if kind != Nodetype.ARRAY:
+        return 1
+    (kind, of), count = of
+    return int(count) if kind == Nodetype.NAME or of[0] == "string" else 1
 
 
 def _messages(reader: AnyReader, topics: set[str]) -> Iterator[_Message]:
