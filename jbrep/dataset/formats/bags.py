@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
+from rosbags.rosbag2.reader import DirectoryReader, Reader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -78,25 +79,26 @@ def open_table(given: str) -> Table:
     )
 
 
-_open_storage = Sqlite3Reader.open
+class _Database(Sqlite3Reader):
+    """A database that has nothing but plain tables."""
+
+    def open(self) -> None:
+        """As in the class above.
+
+        Raises:
+            InputError: it has others, or SQLite would open another file.
+        """
+        path = str(self.path)
+        if any(each in path for each in _OF_ADDRESSES):
+            raise InputError(f"{path} can't be opened with any of {_OF_ADDRESSES} in it: rename it")
+        with closing(sqlite3.connect(f"file:{path}?immutable=1", uri=True)) as database:
+            if computed := database.execute(_COMPUTED).fetchone():
+                raise InputError(f"{path} has the {computed[0]}: a bag has plain tables only")
+        super().open()
 
 
-def _open_checked(storage: Sqlite3Reader) -> None:
-    """Open a database that has nothing but plain tables.
-
-    Raises:
-        InputError: it has others, or SQLite would open another file.
-    """
-    path = Path(str(storage.path))
-    if any(each in str(path) for each in _OF_ADDRESSES):
-        raise InputError(f"{path} can't be opened with any of {_OF_ADDRESSES} in it: rename it")
-    with closing(sqlite3.connect(f"file:{path}?immutable=1", uri=True)) as database:
-        if computed := database.execute(_COMPUTED).fetchone():
-            raise InputError(f"{path} has the {computed[0]}: a bag has plain tables only")
-    _open_storage(storage)
-
-
-Sqlite3Reader.open = _open_checked  # type: ignore[assignment]  # also of what is in a folder
+for _reader, _kind in ((Reader, ".db3"), (DirectoryReader, "sqlite3")):
+    _reader.STORAGE_PLUGINS = {**_reader.STORAGE_PLUGINS, _kind: _Database}
 
 
 @contextmanager
