@@ -35,7 +35,7 @@ from jbrep.evaluate.held_out import (
     sample_rows,
 )
 from jbrep.evaluate.prediction import changes
-from jbrep.evaluate.regression import Predictor, Problem, ridge, varying
+from jbrep.evaluate.regression import Predictor, Problem, ridge
 from jbrep.evaluate.truth import Columns, quantities, quantities_and_features, state
 from jbrep.stats.bootstrap import Array, bootstrap, variation, without_nan
 
@@ -222,7 +222,8 @@ def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
     all are, one direction is left, and it is 0.
     """
     mean, deviation = (getattr(latents, of)(axis=0, dtype=np.float64) for of in ("mean", "std"))
-    factor = _inverse(deviation, varying(latents))
+    magnitude = np.maximum(np.abs(latents).max(axis=0), deviation.max())
+    factor = _inverse(deviation, deviation > np.finfo(np.float32).eps * magnitude)
     standardised = (latents - mean) * factor
     variances, directions = np.linalg.eigh(np.cov(standardised.T).reshape(len(mean), -1))
     kept = variances > _NEGLIGIBLE * variances[-1]

@@ -25,35 +25,30 @@ _LEARNING_RATE = 1e-2  # at its highest
 _RISING = 0.1  # the share of the steps in which the learning rate rises to that
 _LIMIT = 5.0  # standard deviations within which the network sees its input
 _NEGLIGIBLE = 1e-9  # standard deviation, as a share of the largest magnitude: rounding
-_RESOLUTION = float(np.finfo(np.float32).eps)  # of a code, as a share of its largest numbers
+_FAR = 20.0  # standard deviations within which ridge regressions see theirs
 _BLOCK = 1 << 13  # rows predicted at a time
 _PENALTY = 1.0  # of the ridge, on standardised values
-
-
-def varying(values: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which columns of values (n, p) vary by more than rounding, (p,).
-
-    A unit whose standard deviation is below single precision of its own magnitude, or of the most
-    variable unit's, such as a component of features that are equal but for rounding, says nothing.
-    """
-    deviation = values.std(axis=0, dtype=np.float64)
-    magnitude = np.maximum(np.abs(values).max(axis=0), deviation.max())
-    return np.asarray(deviation > _RESOLUTION * magnitude)
 
 
 def ridge(values: NDArray[Any], wanted: NDArray[Any]) -> Predictor:
     """Ridge regressions of all columns (n, k) on standardised values (n, l), as a map.
 
-    Values that only rounding tells apart are left out.
+    Far values count as those at 20 standard deviations: a unit that is constant but for rounding
+    where the regression is fitted could otherwise outweigh all others where it isn't.
     """
     from sklearn.linear_model import Ridge  # not at the top: it takes seconds
-    from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    model = make_pipeline(StandardScaler(), Ridge(_PENALTY))
-    kept = varying(values).astype(np.float64)  # the others become 0
-    model.fit(values * kept, wanted)  # in float64: features may be as good as collinear
-    return lambda others: model.predict(others * kept).reshape(len(others), -1)
+    scaler, model = StandardScaler(), Ridge(_PENALTY)
+    # in float64: features may be as good as collinear
+    model.fit(scaler.fit_transform(values.astype(np.float64)), wanted)
+
+    def predict(others: NDArray[Any]) -> NDArray[Any]:
+        standardised = scaler.transform(others.astype(np.float64))
+        predicted: NDArray[Any] = model.predict(standardised.clip(-_FAR, _FAR))
+        return predicted.reshape(len(others), -1)
+
+    return predict
 
 
 class Problem(NamedTuple):
