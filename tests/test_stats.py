@@ -57,6 +57,7 @@ def make(representation="full", seed=0, level=500.0, **changes):
         "returns": np.clip(rise[:, None] + noise, 0, 1000),
         "total_steps": 10_000,
         "return_floor": 0.0,
+        "reference": 0.0,
         "solved": 900.0,
     }
     return RunCurve(**{**facts, **changes})
@@ -97,6 +98,17 @@ def test_a_failed_run_ends_with_the_worst_whatever_it_had(runs):
     failed = {"steps": steps, "returns": returns, "total_steps": 12_000, "failed_at": 11_500}
     (group,) = groups([*ended, replace(late, **failed)], "full").values()
     assert compared(group).finals["dae-8"][-1] == 0
+
+
+def test_a_run_that_fails_near_the_end_ends_with_the_worst_too(runs):
+    """Without evaluations of more starts; after the last step compared it hasn't failed yet."""
+    late = make("dae-8", 9, 900, failed_at=9999)
+    longer = make("dae-8", 10, 500, total_steps=12_000, failed_at=11_000)
+    (group,) = groups([*runs, late, longer], "full").values()
+    found = compared(group)
+    assert not found.on_all_starts
+    assert found.finals["dae-8"][-2] == 0
+    assert found.finals["dae-8"][-1] > 450
 
 
 def test_one_run_beats_another_as_often_as_pairs_do():

@@ -123,6 +123,14 @@ def _end(run: RunCurve, curve: Array) -> float:
     return float(curve[-1] if run.final is None else run.final.mean())
 
 
+def _ends(runs: Sequence[RunCurve], curves: Array, grid: Array, on_all_starts: bool) -> Array:
+    """The final return of each run, (runs,), as in `Compared`; curves are on the grid."""
+    if on_all_starts:
+        return np.array([*map(_end, runs, curves)])
+    failed = [run.failed_at is not None and run.failed_at <= grid[-1] for run in runs]
+    return np.where(failed, curves[:, -1], final_return(curves, grid))
+
+
 class Compared(NamedTuple):
     """The runs of a group where they are compared."""
 
@@ -131,7 +139,8 @@ class Compared(NamedTuple):
     # of each representation's runs on the grid, (runs, g), the baseline first
     curves: dict[str, Array]
     finals: dict[str, Array]  # the final return of each of these runs, (runs,)
-    # whether that is the mean of the last evaluation, of its starts, or by `final_return`
+    # whether that is the mean of the last evaluation, of its starts, or by `final_return`; of a
+    # run that has failed by then it is its failure_return
     on_all_starts: bool
 
     @property
@@ -148,10 +157,8 @@ def compared(group: Group) -> Compared:
     """
     grid, cut = common_grid(group)
     curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in group.items()}
-    if on_all_starts := _end_on_all_starts(group, grid):
-        finals = {n: np.array([*map(_end, runs, curves[n])]) for n, runs in group.items()}
-    else:
-        finals = {n: final_return(each, grid) for n, each in curves.items()}
+    on_all_starts = _end_on_all_starts(group, grid)
+    finals = {n: _ends(runs, curves[n], grid, on_all_starts) for n, runs in group.items()}
     return Compared(grid, cut, curves, finals, on_all_starts)
 
 
