@@ -61,6 +61,7 @@ def runs():
                     *(task, algorithm, label, seed, "s", STEPS, returns.clip(0, 1000)),
                     total_steps=50_000,
                     return_floor=0,
+                    reference=0,
                     solved=900,
                     failed_at=30_000 if (label, seed) == ("pca-4", 3) else None,
                 )

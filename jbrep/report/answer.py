@@ -54,6 +54,7 @@ def _returns(groups: Sequence[GroupAnalysis]) -> str:
     )
     for policies, how in ((blind, "policies that don't look: "), (written, "")):
         told += f"; {how}{', '.join(policies)}" if policies else ""
+    told += "" if blind else "; what policies that don't look would return isn't known"
     return f"{told}. {_learnt(agents)}"
 
 

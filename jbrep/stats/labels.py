@@ -88,7 +88,10 @@ def describe(
 
 
 def learnt(final: Array, blind: Interval, bounds: Bounds) -> str:
-    """Whether final returns lie above a mean return beyond what is uncertain of either."""
+    """Whether final returns lie above a mean return beyond what is uncertain of either.
+
+    It is unclear at most where that return has no upper end.
+    """
     if surely_above(final, blind.value, bounds) and not final.mean() <= blind.high:
         return YES
     return UNCLEAR if final.mean() > blind.value else NO

@@ -24,8 +24,7 @@ class Scale(NamedTuple):
 
     grid: Array  # training steps at which runs are compared, (g,)
     reference: float  # the final return that gains are counted over, by `references`
-    # the mean return of the best policy that doesn't look, with its interval, else the reference
-    blind: Interval
+    blind: Interval  # the mean return of the best policy that doesn't look, by `_blind`
     # the return to reach for each of STEPS_TO, NaN where there is none
     thresholds: Mapping[str, float]
     # at which performance profiles are evaluated, (k,): round numbers that enclose all final
@@ -64,7 +63,6 @@ def scale_of(compared: Compared, run: RunCurve, policies: Mapping[str, Interval]
     """
     grid, curves, finals = compared.grid, compared.of_baseline, [*compared.finals.values()]
     reference, over = references(compared, run)
-    best = best_blind({name: float(each.value) for name, each in policies.items()})
     gained = surely_above(finals[0], reference, run.bounds)
     gain = float(np.median(final_return(curves, grid))) - over
     shares = [over + share * gain if gained and gain > 0 else np.nan for share in SHARES.values()]
@@ -72,10 +70,24 @@ def scale_of(compared: Compared, run: RunCurve, policies: Mapping[str, Interval]
     return Scale(
         grid=grid,
         reference=reference,
-        blind=policies[best] if best else UNDEFINED._replace(value=reference),
+        blind=_blind(compared, run, policies),
         thresholds=dict(zip(STEPS_TO, thresholds, strict=True)),
         profile_returns=_round_numbers(np.concatenate(finals), run.return_floor),
     )
+
+
+def _blind(compared: Compared, run: RunCurve, policies: Mapping[str, Interval]) -> Interval:
+    """The mean return of the best policy that doesn't look, with its interval.
+
+    Where none is known it may be anything from the least possible return, or that of untrained
+    policies, upwards.
+    """
+    if best := best_blind({name: float(each.value) for name, each in policies.items()}):
+        return policies[best]
+    if run.reference is not None:
+        return UNDEFINED._replace(value=run.reference)
+    untrained = float(compared.of_baseline[:, 0].mean())
+    return Interval(max(untrained, run.bounds.low), np.nan, np.inf)
 
 
 def _round_numbers(returns: Array, floor: float | None) -> Array:
