@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from jbrep.report.markdown import markdown
 from jbrep.report.report import statistics, write_report
 from jbrep.report.statistics import group_tables
 from jbrep.report.tables import read_tables
+from jbrep.report.words import deciding
 from jbrep.stats.power import Arms, Prospect, prospects
 from jbrep.stats.rules import Planned, Rules
 from jbrep.study.config import as_study
@@ -112,6 +114,14 @@ def test_the_end_says_what_is_true(looks):
     gains = [(500 - each) / (850 - each) for each in over]
     assert 1 - worse.optimality_gap.value == pytest.approx(np.mean(gains), abs=0.03)
     assert better.optimality_gap.value < 0.02
+
+
+@pytest.mark.parametrize(
+    ("level", "said"), [(0.05, "95"), (0.05 / 3, "98.33"), (0.0004, "99.96"), (2.5e-6, "99.99975")]
+)
+def test_no_level_of_an_interval_is_rounded_to_100_percent(looks, level, said):
+    verdict, *_ = cell(looks[1][SEEDS][0], "face_direction", "dae-8")
+    assert deciding(replace(verdict, level=level)).endswith(f"] at {said} %")
 
 
 def test_seeds_that_were_added_are_exploratory(looks):

@@ -14,6 +14,7 @@ from jbrep.report.tables import Tables
 from jbrep.report.words import (
     EFFECTS,
     caveats,
+    deciding,
     notes,
     over,
     probability,
@@ -28,7 +29,6 @@ from jbrep.rl.files import FAILED
 from jbrep.stats.aggregates import Aggregate
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.association import Association
-from jbrep.stats.claims import Verdict
 from jbrep.stats.comparison import Comparison
 from jbrep.stats.labels import RepresentationResult
 from jbrep.stats.power import Prospect
@@ -78,7 +78,7 @@ def decided_tables(analysis: Analysis) -> list[Table]:
             (
                 f"{name}: {verdict.claim}",
                 verdict.verdict,
-                _deciding(verdict),
+                "-" if math.isnan(verdict.interval.low) else deciding(verdict),
             )
             for name, verdict in decided
         ]
@@ -91,13 +91,6 @@ def decided_tables(analysis: Analysis) -> list[Table]:
         if rows:
             found.append(Table(title, header, rows))
     return found
-
-
-def _deciding(verdict: Verdict) -> str:
-    """The interval of a verdict with its level, if there is one."""
-    if math.isnan(verdict.interval.low):
-        return "-"
-    return f"{told(verdict.claim, verdict.interval)} at {100 * (1 - verdict.level):.3g} %"
 
 
 def _last(tables: Tables, width: int | None) -> str:

@@ -180,9 +180,14 @@ def tested(verdict: Verdict) -> str:
     _, low, high = verdict.interval
     if math.isnan(verdict.level) or math.isnan(low) or math.isnan(high):
         return ""
-    level, boundary = f"{100 * (1 - verdict.level):.4g} %", shown_number(verdict.boundary)
-    interval = told(verdict.claim, verdict.interval)
-    return f"{interval} at {level}, which {_place(verdict)} {boundary}"
+    return f"{deciding(verdict)}, which {_place(verdict)} {shown_number(verdict.boundary)}"
+
+
+def deciding(verdict: Verdict) -> str:
+    """The interval that decides, with its level: two digits at least of what it lacks of 100 %."""
+    digits = max(4, 1 - math.floor(math.log10(verdict.level)))
+    level = f"{100 * (1 - verdict.level):.{digits}g} %"
+    return f"{told(verdict.claim, verdict.interval)} at {level}"
 
 
 def _place(verdict: Verdict) -> str:
