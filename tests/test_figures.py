@@ -317,6 +317,18 @@ def test_a_ratio_far_from_one_is_marked_at_the_edge(analysis):
     assert (low, 0, "<") in cut_marks(axes, "<>")
 
 
+def test_an_interval_without_an_end_is_drawn_to_the_edge(analysis):
+    (group, *_), open_ended = analysis.groups, Interval(1.1, 0.8, np.inf)
+    first, *others = group.comparisons[0].verdicts
+    verdicts = (replace(first, estimate=open_ended, interval=open_ended), *others)
+    comparisons = (replace(group.comparisons[0], verdicts=verdicts),)
+    changed = replace(group, labels=group.labels[:2], comparisons=comparisons)
+    axes = drawn(claim_plot(replace(analysis, groups=(changed,)), lambda: styles(FINAL))).axes[0]
+    right = axes.get_xlim()[1]
+    assert [*axes.lines[3].get_xdata()] == [0.8, right]
+    assert (right, 0, ">") in cut_marks(axes, "<>")
+
+
 def test_a_profile_falls_from_all_runs_to_none(analysis):
     group = analysis.groups[0]
     label = group.labels[0]

@@ -14,6 +14,7 @@ from scipy.stats import (
 )
 
 from jbrep.errors import InputError
+from jbrep.report.words import shown
 from jbrep.stats.analysis import analyse
 from jbrep.stats.arms import Arm, Frame, Sides, measure
 from jbrep.stats.claims import NOT_WORSE, kept_gain
@@ -179,7 +180,10 @@ def test_what_is_kept_of_a_gain_ends_where_its_test_does():
     np.testing.assert_allclose(found, (share, low, high))
     assert np.isnan(kept_gain(sides._replace(y=plain_arm(drawn(200, 10, 8, 2))), 0.95)).all()
     unsure = plain_arm(np.array([100, 900.0, 120, 880]))
-    assert kept_gain(sides._replace(y=unsure), 0.95).high == 1000  # as far as is looked
+    found = kept_gain(sides._replace(y=unsure), 0.95)
+    assert found.high == np.inf
+    assert shown(found) == "2.28 [0.588, unbounded]"
+    assert found.tolist()[2] is None
 
 
 def test_arms_are_measured_on_one_scale():

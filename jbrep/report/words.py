@@ -20,7 +20,7 @@ from jbrep.stats.comparison import Comparison
 from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.scale import STILL
 from jbrep.study.record import RegistrationFacts
-from jbrep.text import SIGNIFICANT, interval, number, possessive
+from jbrep.text import SIGNIFICANT, number, possessive
 
 EFFECTS = (  # of `jbrep.stats.power`
     f"Power of {NOT_WORSE.name!r} and {WITHIN_HALF.name!r}: if agents keep all of the gain, and "
@@ -281,8 +281,12 @@ def reference_words(group: GroupAnalysis) -> str:
 
 
 def shown(values: Interval, form: str = SIGNIFICANT) -> str:
-    """A value with its interval, if it has one; a dash for what isn't finite."""
-    return interval(values.tolist(), form)
+    """A value with its interval, if it has one; a dash for a value that isn't finite."""
+    value, *ends = map(float, values)
+    if any(map(math.isnan, ends)):
+        return shown_number(value, form)
+    low, high = ("unbounded" if math.isinf(end) else shown_number(end, form) for end in ends)
+    return f"{shown_number(value, form)} [{low}, {high}]"
 
 
 def shown_number(value: float, form: str = SIGNIFICANT) -> str:

@@ -239,8 +239,8 @@ def share_of_gain(x: Array, y: Array, reference: float, bounds: Bounds, level: f
     """The gain of x (n,) over a reference as a share of that of y (m,), with its interval.
 
     The interval has the shares c with which the interval of mean(x) - c mean(y) has what the
-    reference would give (Fieller 1954), as far as they are looked for: an end is 1,000 or -1,000
-    where y may not gain anything.
+    reference would give (Fieller 1954). An end is infinite where y may not gain anything: no share
+    is excluded in that direction, as far as they are looked for.
     """
     gained, of_y = x.mean() - reference, y.mean() - reference
     if of_y <= 0:
@@ -255,7 +255,10 @@ def share_of_gain(x: Array, y: Array, reference: float, bounds: Bounds, level: f
 
 
 def _end(room: Callable[[float, int], float], value: float, direction: int) -> float:
-    """The share in a direction from which on the interval is on one side; NaN if it has none."""
+    """The share in a direction from which on the interval is on one side; NaN if it has no width.
+
+    It is infinite if there is no such share.
+    """
     if np.isnan(room(value, direction)):
         return np.nan
     step = 0.25
@@ -263,4 +266,4 @@ def _end(room: Callable[[float, int], float], value: float, direction: int) -> f
         if room(value + direction * step, direction) < 0:
             return float(brentq(room, value, value + direction * step, (direction,)))
         step *= 2
-    return direction * _FURTHEST
+    return direction * math.inf

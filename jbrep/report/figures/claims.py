@@ -109,12 +109,14 @@ def _scale(axes: Axes, is_ratio: bool, groups: Groups, numbers: Sequence[int]) -
 
 
 def _draw_panel(axes: Axes, group: GroupAnalysis, numbers: Sequence[int], look: Styles) -> None:
+    left, right = axes.get_xlim()
     for verdict in _verdicts([group], numbers)[: len(numbers)]:
         axes.axvline(verdict.boundary, **reference())
     for row, comparison in enumerate(group.comparisons):
         verdict, style = comparison.verdicts[numbers[0]], look[comparison.representation]
         for (_, *ends), width in ((verdict.interval, 0.8), (verdict.estimate, 2)):
-            axes.plot(ends, [row, row], color=style["color"], linewidth=width)
+            drawn = np.nan_to_num(ends, nan=np.nan, neginf=left, posinf=right)
+            axes.plot(drawn, [row, row], color=style["color"], linewidth=width)
         axes.plot([verdict.estimate.value], [row], style["marker"], color=style["color"], ms=4)
         mark_cut(axes, "x", row, [*verdict.estimate, *verdict.interval], style["color"])
     axes.grid(visible=False, axis="y")
