@@ -510,9 +510,12 @@ def test_a_report_compares_with_the_study_s_baseline(whole, tmp_path):
     record = read_document(tmp_path / RECORD, RunsRecord)
     against = record.study.replace(verdicts=Rules(baseline="pca-8"))
     record.replace(study=against).write(tmp_path / RECORD)
-    told = markdown(read_tables(tmp_path), [], [], "figure.png")
+    tables = read_tables(tmp_path)
+    told = markdown(tables, [], [], "figure.png")
     assert "of pca-8's gain" in told
     assert "full's" not in told
+    claims = [each.claim.statement for each in answers(tables.analysis)]
+    assert claims[0] == "Agents lose at most 10 % of the gain on pca-8"
 
 
 def test_where_the_baseline_did_not_learn_nothing_is_compared(whole, tmp_path):

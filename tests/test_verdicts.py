@@ -14,11 +14,13 @@ from small import adopt
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.report import report
+from jbrep.report.answer import answer
 from jbrep.report.markdown import markdown
 from jbrep.report.report import statistics, write_report
 from jbrep.report.statistics import group_tables
 from jbrep.report.tables import read_tables
-from jbrep.report.words import deciding
+from jbrep.report.words import deciding, told
+from jbrep.stats.bootstrap import Interval
 from jbrep.stats.power import Arms, Prospect, prospects
 from jbrep.stats.rules import Planned, Rules
 from jbrep.study.config import as_study
@@ -124,6 +126,10 @@ def test_no_level_of_an_interval_is_rounded_to_100_percent(looks, level, said):
     assert deciding(replace(verdict, level=level)).endswith(f"] at {said} %")
 
 
+def test_what_rounds_to_no_steps_has_no_direction():
+    assert told("faster", Interval(-0.4, -1234.5, 0.6)) == "0 [1,234 faster, 1 slower]"
+
+
 def test_seeds_that_were_added_are_exploratory(looks):
     analysis, page, text = looks[1][SEEDS + 2]
     first, *_ = cell(analysis, "face_direction", "dae-8")
@@ -146,6 +152,11 @@ def test_there_is_no_verdict_over_policies_that_are_not_known(looks, tmp_path):
     )
     assert {(each.verdict, each.reason) for each in found} == {("not yet", why)}
     assert f"**Nothing is decided yet: {why}.**" in markdown(tables, [], [], "figure.png")
+    (group, other), comparisons = tables.analysis.groups, tables.analysis.groups[0].comparisons
+    later = replace(comparisons[1], verdicts=[replace(v, reason="no run") for v in found])
+    group = replace(group, comparisons=(comparisons[0], later))
+    analysis = replace(tables.analysis, groups=(group, other))
+    assert f"Nothing is decided yet: {why}; no run." in answer(tables._replace(analysis=analysis))
 
 
 def test_a_reader_gets_the_numbers_with_numpy_alone(looks, monkeypatch, capsys):

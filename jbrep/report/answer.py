@@ -132,9 +132,10 @@ def _decided(
     claims: Sequence[str], cells: Sequence[tuple[str, Sequence[Verdict]]]
 ) -> Iterable[str]:
     """What is found of each claim that anything is decided of; then of all others."""
-    first = cells[0][1][0]
-    if all(verdict.verdict == NOT_YET for _, verdicts in cells for verdict in verdicts):
-        yield f"Nothing is decided yet: {first.reason}."
+    every = [verdict for _, verdicts in cells for verdict in verdicts]
+    if all(verdict.verdict == NOT_YET for verdict in every):
+        reasons = dict.fromkeys(verdict.reason or "" for verdict in every)
+        yield f"Nothing is decided yet: {'; '.join(reasons)}."
         return
     silent = []
     for position, claim in enumerate(claims):

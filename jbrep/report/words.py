@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from jbrep.encoders import FULL
 from jbrep.stats import Analysis
 from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.bootstrap import Interval
@@ -42,8 +43,8 @@ _OVER = {
     "blind": "the better of standing still and random actions",
     "still": "standing still",
 }
-_CLAIMS = {  # as a sentence, with a place for the percentage that may be lost; what is estimated
-    NOT_WORSE.name: ("Agents on less state lose at most {} of the gain", _KEPT),
+_CLAIMS = {  # as a sentence; what is estimated
+    NOT_WORSE.name: ("{agents} lose at most {percent} of {gain}", _KEPT),
     LESS_VARIANCE.name: (
         "Their training varies less from run to run",
         "spread of training curves, as a multiple of that on {baseline}",
@@ -52,7 +53,7 @@ _CLAIMS = {  # as a sentence, with a place for the percentage that may be lost; 
         "They learn faster",
         "steps to half of the gain on {baseline}, beside what agents there take",
     ),
-    WITHIN_HALF.name: ("They lose at most {} of it", _KEPT),
+    WITHIN_HALF.name: ("They lose at most {percent} of it", _KEPT),
 }
 _BESIDE = {  # a claim's verdict: what else is known of it
     NOT_WORSE.name: ("Difference of final returns", "final_return_difference"),
@@ -96,14 +97,20 @@ def over(rules: Rules) -> str:
 
 def statements(planned: Planned) -> list[Statement]:
     """What is claimed, in the order of the tests."""
-    found, rules, whose = [], planned.rules, possessive(planned.rules.baseline)
+    found, rules = [], planned.rules
+    is_full = rules.baseline == FULL
+    words = {
+        "baseline": rules.compared_with,
+        "whose": possessive(rules.baseline),
+        "over": over(rules),
+        "agents": "Agents on less state" if is_full else "Agents",
+        "gain": "the gain" if is_full else f"the gain on {rules.baseline}",
+    }
     for name in rules.claims:
         claim = CLAIMS[name]
-        percent = f"{100 * (1 - claim.boundary(rules.margin)):.3g} %"
-        sentence, estimand = _CLAIMS[name]
-        against = {"whose": whose, "baseline": rules.compared_with, "over": over(rules)}
-        head, estimated = _HEADS[name].format(**against), estimand.format(**against)
-        found.append(Statement(name, head, sentence.format(percent), estimated, claim.is_ratio))
+        words["percent"] = f"{100 * (1 - claim.boundary(rules.margin)):.3g} %"
+        told = (each.format(**words) for each in (_HEADS[name], *_CLAIMS[name]))
+        found.append(Statement(name, *told, claim.is_ratio))
     return found
 
 
@@ -211,7 +218,8 @@ def told(claim: str, estimate: Interval) -> str:
 
 
 def _later(steps: float) -> str:
-    return f"{abs(steps):,.0f} {'slower' if steps > 0 else 'faster'}"
+    count = f"{abs(steps):,.0f}"
+    return count if count == "0" else f"{count} {'slower' if steps > 0 else 'faster'}"
 
 
 def enumerated(names: Sequence[str]) -> str:
