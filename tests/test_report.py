@@ -34,8 +34,9 @@ from jbrep.report.figures import study_plots, write
 from jbrep.report.markdown import escape, markdown
 from jbrep.report.page import page as page_of
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, STATISTICS, SUMMARY
+from jbrep.report.returns import returns_tables
 from jbrep.report.tables import read_tables
-from jbrep.report.words import answers
+from jbrep.report.words import answers, reference_words
 from jbrep.rl.files import ENCODER, EVALUATIONS, Evaluation, read_run
 from jbrep.stats.claims import CLAIMS, FASTER
 from jbrep.stats.rules import Rules
@@ -43,7 +44,7 @@ from jbrep.study.config import Study, as_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.results import write_tables
-from jbrep.study.tables import REFERENCE_RETURNS, write_references
+from jbrep.study.tables import REFERENCE_RETURNS, RunInfo, write_references
 from jbrep.text import SIGNIFICANT, Table, number
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -322,7 +323,7 @@ def test_the_markdown_shows_verdicts_numbers_and_a_figure_that_is_there(whole):
     (figure,) = re.findall(r"!\[.*\]\((.*)\)", text)
     assert (whole / figure).exists()
     assert "| full | 4 | - |" in text
-    assert "> 1 run is counted as return 0" in text
+    assert "> 1 run is counted as return 0, the least possible, from the step of failure" in text
     assert "| representation | of full's gain | spread" in text  # each estimate once
     assert "exploratory" not in text.partition("of full's gain")[2]
     assert re.search(r"\n\| standing still \| .* \| 260 \[", text)
@@ -516,6 +517,43 @@ def test_a_report_compares_with_the_study_s_baseline(whole, tmp_path):
     assert "full's" not in told
     claims = [each.claim.statement for each in answers(tables.analysis)]
     assert claims[0] == "Agents lose at most 10 % of the gain on pca-8"
+
+
+def test_gains_over_another_policy_than_the_best_are_told_as_such(whole, tmp_path):
+    """The better of standing still and random actions, where a constant drive returns more."""
+    copy_tables(whole, tmp_path)
+    path = tmp_path / REFERENCE_RETURNS
+    more = re.sub(r"(constant drive,\d+),.*", r"\1,400", path.read_text())
+    path.write_text(re.sub(r"(random,\d+),.*", r"\1,320", more))
+    adopt(tmp_path / RECORD, REFERENCE_RETURNS)
+    record = read_document(tmp_path / RECORD, RunsRecord)
+    blind = record.study.replace(verdicts=Rules(gains_over="blind"))
+    record.replace(study=blind).write(tmp_path / RECORD)
+    tables = read_tables(tmp_path)
+    (table,) = returns_tables(tables)
+    assert table.title.endswith("; gains are over random, as it was registered")
+    assert "over constant drive" in table.header
+    assert reference_words(tables.analysis.groups[0]) == "what random returns, 320"
+
+
+def test_the_table_of_returns_says_what_its_shares_are_of(whole):
+    tables = read_tables(whole)
+    won = [
+        RunInfo("face_direction", "sac", "full", seed, 2000, episode, "won", 1.0)
+        for seed in STUDY.seeds
+        for episode in range(2)
+    ]
+    (table,) = returns_tables(tables._replace(infos=won))
+    assert "share of won" in table.header
+    assert table.title.endswith("; shares of episodes leave out runs that failed")
+    (group,) = tables.analysis.groups
+    comparisons = [
+        replace(each, verdicts=[replace(verdict, encoders=8) for verdict in each.verdicts])
+        for each in group.comparisons
+    ]
+    groups = (replace(group, comparisons=comparisons),)
+    (table,) = returns_tables(tables._replace(analysis=replace(tables.analysis, groups=groups)))
+    assert table.title.endswith("of 8 encoders or more, intervals of shares are over encoders")
 
 
 def test_where_the_baseline_did_not_learn_nothing_is_compared(whole, tmp_path):

@@ -126,6 +126,18 @@ def test_no_level_of_an_interval_is_rounded_to_100_percent(looks, level, said):
     assert deciding(replace(verdict, level=level)).endswith(f"] at {said} %")
 
 
+def test_a_verdict_may_come_where_other_starts_might_change_whether_agents_learned(looks):
+    tables = read_tables(looks[0].parent / "whole")
+    (group, other), analysis = tables.analysis.groups, tables.analysis
+    unclear = replace(group, labels=(replace(group.labels[0], learnt="unclear"), *group.labels[1:]))
+    said = answer(tables._replace(analysis=replace(analysis, groups=(unclear, other))))[-1]
+    assert said.startswith(
+        "Agents on full didn't clearly learn on face_direction, sac: nothing but what was "
+        "registered can be compared there; for that it is enough to end above the best policy that "
+        "doesn't look on these starts. Decided: 'not worse' is supported for dae-8"
+    )
+
+
 def test_what_rounds_to_no_steps_has_no_direction():
     assert told("faster", Interval(-0.4, -1234.5, 0.6)) == "0 [1,234 faster, 1 slower]"
 

@@ -1,5 +1,6 @@
 """The answer of a study in a few sentences: what agents return, which learned, what is decided."""
 
+import math
 from collections.abc import Iterable, Sequence
 
 from jbrep.report.returns import by_task, named, shown_return
@@ -104,7 +105,7 @@ def _conclusion(analysis: Analysis) -> Iterable[str]:
         what = "but what was registered " if any(group.is_judged for group in silent) else ""
         yield (
             f"Agents on {analysis.baseline} didn't {surely}learn{where}: nothing {what}can be "
-            f"compared {'there' if where else 'with them'}."
+            f"compared {'there' if where else 'with them'}{_enough(analysis, silent)}."
         )
     cells = [(group, each) for group in compared for each in group.comparisons]
     judged = [(group, each) for group, each in cells if each.is_judged]
@@ -126,6 +127,14 @@ def _conclusion(analysis: Analysis) -> Iterable[str]:
         each = counted(runs[0], "run") if len({*runs}) == 1 else f"{min(runs)} to {max(runs)} runs"
         none = ": no conclusion" if max(runs) < FEWEST_UNITS else ""
         yield f"With {each} of each and no claim registered, this is exploratory{none}."
+
+
+def _enough(analysis: Analysis, silent: Sequence[GroupAnalysis]) -> str:
+    """What was enough where verdicts have something to go by all the same."""
+    judged = (each for group in silent for each in group.comparisons if each.is_judged)
+    if all(math.isnan(each.verdicts[0].estimate.value) for each in judged):
+        return ""
+    return f"; for that it is enough to end above {over(analysis.planned.rules)} on these starts"
 
 
 def _decided(

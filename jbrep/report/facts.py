@@ -1,6 +1,7 @@
 """Everything in a report but its statistics: what ran, how, and how to run it again."""
 
 import json
+import math
 import shlex
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,6 +20,7 @@ from jbrep.report.tables import Tables
 from jbrep.report.words import shown_number
 from jbrep.rl.files import ENCODER, FAILED
 from jbrep.rl.settings import TrainingSettings
+from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study
 from jbrep.study.record import EACH_ITS_OWN, EncoderFacts, Label, RunsRecord
@@ -122,11 +124,15 @@ def _failing(tables: Tables) -> str:
     failed = [group for group in groups if any(label.failed for label in group.labels)]
     if not failed:
         return "marked as failed"
-    returns = " or ".join(dict.fromkeys(shown_number(group.failure_return) for group in failed))
-    return (
-        f"counted as return {returns}, the worst of the task and algorithm, from the step of "
-        "failure on"
-    )
+    worst = ", or ".join(dict.fromkeys(map(_worst, failed)))
+    return f"counted as return {worst}, from the step of failure on"
+
+
+def _worst(group: GroupAnalysis) -> str:
+    """The return of a failed run, and which one that is."""
+    is_floor = not math.isnan(group.return_floor)
+    which = "the least possible" if is_floor else "the worst of the task and algorithm"
+    return f"{shown_number(group.failure_return)}, {which}"
 
 
 def _runs(which: Sequence[object]) -> str:

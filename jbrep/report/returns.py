@@ -10,8 +10,9 @@ from jbrep.report.shares import Cells, share_cells
 from jbrep.report.tables import Tables
 from jbrep.report.words import reference_words, shown, shown_number
 from jbrep.stats.analysis import Analysis, GroupAnalysis
+from jbrep.stats.arms import FEWEST_UNITS
+from jbrep.stats.comparison import Comparison
 from jbrep.stats.labels import REACHED, RepresentationResult
-from jbrep.stats.scale import STILL, best_blind
 from jbrep.text import Table, possessive
 
 _MOST_DIGITS = 9  # after the point
@@ -50,12 +51,12 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
     """A row for each agent, then for each policy that doesn't learn; no column without content."""
     first = groups[0]
     kept = {
-        comparison.representation: comparison.verdicts[0].estimate
+        comparison.representation: comparison
         for comparison in first.comparisons
         if comparison.is_open and first.compares
     }
-    form, best = return_form(groups), best_blind({p: r.value for p, r in first.references.items()})
-    counted_over_still = first.reference_policy == STILL != best
+    form, best = return_form(groups), first.best_policy
+    counted_over_another = first.reference_policy != best
     columns: dict[str, Callable[[RepresentationResult], str]] = {
         "runs": lambda label: str(len(label.seeds)),
         "failed": lambda label: str(len(label.failed) or "-"),
@@ -63,11 +64,13 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
         "learned": lambda label: label.learnt,
         f"over {best}": lambda label: (
             shown_number(float(label.numbers["final_return_mean"].value) - first.blind.value, form)
-            if counted_over_still
+            if counted_over_another
             else "-"
         ),
         f"of {possessive(analysis.baseline)} gain": lambda label: (
-            shown(kept[label.representation], ".2f") if label.representation in kept else "-"
+            shown(kept[label.representation].verdicts[0].estimate, ".2f")
+            if label.representation in kept
+            else "-"
         ),
         **_share_columns(groups, shares),
     }
@@ -82,13 +85,22 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
     title += "; 95 % intervals over runs" if several else ""
     found = _without_nothing(Table(title, (what, *columns), rows))
     if f"of {possessive(analysis.baseline)} gain" in found.header:
-        gained = f"gains are over {first.reference_policy or reference_words(first)}"
-        gained += ", as it was registered" if counted_over_still else ""
-        counts_all = all(c.counts_all for c in first.comparisons if c.representation in kept)
-        gained += "" if counts_all else "; shares are of the runs that verdicts count"
-        gained += "; shares compare each two as far as both go" if first.cut else ""
-        return found._replace(title=f"{found.title}; {gained}")
-    return found
+        title += f"; {_gained(first, [*kept.values()])}"
+    if {*shares} & {*found.header} and any(label.failed for _, label in named(groups)):
+        title += "; shares of episodes leave out runs that failed"
+    return found._replace(title=title)
+
+
+def _gained(group: GroupAnalysis, kept: Sequence[Comparison]) -> str:
+    """What the column of gains is: over what they are, of which runs its shares."""
+    told = f"gains are over {group.reference_policy or reference_words(group)}"
+    if group.reference_policy != group.best_policy and group.reference_policy:
+        told += ", as it was registered"
+    if not all(comparison.counts_all for comparison in kept):
+        told += "; shares are of the runs that verdicts count"
+    if any(comparison.verdicts[0].encoders for comparison in kept):
+        told += f"; of {FEWEST_UNITS} encoders or more, intervals of shares are over encoders"
+    return told + ("; shares compare each two as far as both go" if group.cut else "")
 
 
 def _share_columns(

@@ -109,8 +109,9 @@ def statements(planned: Planned) -> list[Statement]:
     for name in rules.claims:
         claim = CLAIMS[name]
         words["percent"] = f"{100 * (1 - claim.boundary(rules.margin)):.3g} %"
-        told = (each.format(**words) for each in (_HEADS[name], *_CLAIMS[name]))
-        found.append(Statement(name, *told, claim.is_ratio))
+        texts = (_HEADS[name], *_CLAIMS[name])
+        head, statement, estimand = (each.format(**words) for each in texts)
+        found.append(Statement(name, head, statement, estimand, claim.is_ratio))
     return found
 
 
@@ -277,10 +278,11 @@ def _deviations(registration: RegistrationFacts | None) -> str:
 
 def reference_words(group: GroupAnalysis) -> str:
     """What gains are counted over."""
-    if group.reference_policy == STILL:
-        what = "what standing still returns"
-    elif group.reference_policy:
-        what = f"what the best policy that doesn't look returns ({group.reference_policy})"
+    policy = group.reference_policy
+    if policy and policy == group.best_policy != STILL:
+        what = f"what the best policy that doesn't look returns ({policy})"
+    elif policy:
+        what = f"what {policy} returns"
     elif not math.isnan(group.return_floor):
         what = "the least possible return"
     else:

@@ -15,7 +15,7 @@ from jbrep.stats.intervals import LEVEL, mean_within
 from jbrep.stats.labels import YES, RepresentationResult, describe
 from jbrep.stats.rules import Planned
 from jbrep.stats.runs import Group, RunCurve, evaluated_run, groups
-from jbrep.stats.scale import SOLVED, scale_of
+from jbrep.stats.scale import SOLVED, best_blind, scale_of
 
 References = Mapping[str, Mapping[str, Sequence[float]]]  # returns by task and policy
 
@@ -47,6 +47,11 @@ class GroupAnalysis:
     def solved(self) -> float:
         """The return from which on the task counts as solved; NaN if unknown."""
         return self.thresholds[SOLVED]
+
+    @property
+    def best_policy(self) -> str | None:
+        """The best of the policies that don't look; None if there is none."""
+        return best_blind({policy: mean.value for policy, mean in self.references.items()})
 
     @property
     def is_judged(self) -> bool:
