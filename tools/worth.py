@@ -247,7 +247,7 @@ def main(*folders: str) -> None:
     rows = [(name, *(interval(each.tolist(), ".2f") for each in found[name])) for name in found]
     header = ("ranked by", *(each.task for each in tasks), "mean", f"above {REWARDED}")
     counts = f"{len(first.codes)} codes of {len({*first.families})} families"
-    title = f"Rank correlations with mean final returns, {counts}"
+    title = f"Rank correlations with mean final returns of all runs but one, {counts}"
     print(Table(title, (*header, f"above {SHORT}"), rows).text())
     if PRIMARY in found:
         print(f"\n{verdict(*found[PRIMARY][-3:])}")
