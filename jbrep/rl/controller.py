@@ -13,6 +13,7 @@ from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.file import load
 from jbrep.encoders.fold import Chain
 from jbrep.encoders.layers import ACTIVATIONS, Layer, activate, run
+from jbrep.envs.recording import held
 from jbrep.envs.view import Window
 from jbrep.errors import DamageError, InputError, choose, first_line, listed
 from jbrep.records.container import Tensors
@@ -131,8 +132,8 @@ class Controller:
 
     def reset(self) -> None:
         """Begin another episode, of any number of robots: the next call chooses an action."""
+        self._act = held(self._chosen, self.action_repeat)
         self._held: NDArray[np.float32] | None = None  # the action of the last call
-        self._left = 0  # calls for which it is still held
         self._window: Window | None = None
 
     def __call__(self, observation: ArrayLike) -> NDArray[np.float32]:
@@ -155,7 +156,9 @@ class Controller:
                 "numbers in one array, as gymnasium.spaces.flatten(env.observation_space, "
                 "observation) gives them"
             ) from None
-        self._held = self._act(self._seen(rows))
+        seen = self._seen(rows)
+        self._held = self._act(seen.observation)
+        self._window = seen.window
         return self._held.copy()
 
     def _seen(self, observation: NDArray[np.float32]) -> _Seen:
@@ -195,14 +198,6 @@ class Controller:
         if not finite.all():
             name = names[int(np.argwhere(~finite)[0, -1])]
             raise InputError(f"{name} is not finite: the policy takes finite numbers")
-
-    def _act(self, seen: _Seen) -> NDArray[np.float32]:
-        """The action that is held, or else chosen."""
-        action = self._held
-        if action is None or not self._left:
-            action, self._left = self._chosen(seen.observation), self.action_repeat
-        self._window, self._left = seen.window, self._left - 1
-        return action
 
     def _chosen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         if observation.ndim == 1 and not self._one_row:
