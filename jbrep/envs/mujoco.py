@@ -124,12 +124,12 @@ def _row(
 
 def _planar_root(model: mujoco.MjModel) -> tuple[int, int, int] | None:
     """The joints by which a body moves along the world's x and y and turns about z."""
-    root, along_the_world = root_of(model), (1, 0, 0, 0)
+    root, unturned = root_of(model), (1, 0, 0, 0)
     for body in sorted(range(1, model.nbody), key=lambda body: body != root):
         first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
         if model.body_parentid[body] or count < 3:
             continue
-        if not np.array_equal(model.body_quat[body], along_the_world):
+        if not np.array_equal(model.body_quat[body], unturned):
             continue
         kinds = model.jnt_type[first : first + 3].tolist()
         slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE

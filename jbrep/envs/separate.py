@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jbrep.envs import instances
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
-from jbrep.envs.make import aside, flattener, number, of_size, reason
+from jbrep.envs.make import action_in, aside, flattener, number, of_size, reason
 from jbrep.envs.task import Array, Task, most_held
 from jbrep.errors import InputError, Notice
 
@@ -98,8 +98,7 @@ class Separate:
             raise
         self.metadata: Mapping[str, Any] = self.envs[0].metadata
         self._flat = flattener(self.envs[0].observation_space)
-        space: Any = self.envs[0].action_space
-        self._action_type, self._action_shape = space.dtype, space.shape
+        self._action_space = self.envs[0].action_space
         self._offset = task.offset if task.offset.any() else None
         self._observation = np.zeros((num_lanes, task.size))
         self._reward = np.zeros(num_lanes)
@@ -179,7 +178,7 @@ class Separate:
 
     def _step(self, lane: int, action: NDArray[np.float32]) -> tuple[bool, bool]:
         """Step a lane; whether its episode is terminated and truncated."""
-        own = action.astype(self._action_type).reshape(self._action_shape)  # it may change it
+        own = action_in(self._action_space, action)  # which the environment may change
         observation, reward, terminated, truncated, info = self.envs[lane].step(own)
         ends = number(terminated, "terminated"), number(truncated, "truncated")
         self._put(lane, observation, info, number(reward, "reward"), True)

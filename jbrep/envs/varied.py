@@ -12,7 +12,7 @@ from jbrep.envs.domain import Domain, Draws
 from jbrep.envs.mujoco import physics_of, root_of
 from jbrep.envs.task import Array
 
-_VARIED = "geom_friction", "pair_friction", "body_mass", "body_inertia"
+_FRICTIONS, _MASSES = ("geom_friction", "pair_friction"), ("body_mass", "body_inertia")
 
 
 def put_factors(
@@ -27,10 +27,9 @@ def put_factors(
         mass: that of all bodies, with their inertias.
         data: of a model of the same sizes, whose contents are lost.
     """
-    model.geom_friction[:] = friction * usual.geom_friction
-    model.pair_friction[:] = friction * usual.pair_friction
-    model.body_mass[:] = mass * usual.body_mass
-    model.body_inertia[:] = mass * usual.body_inertia
+    for names, factor in ((_FRICTIONS, friction), (_MASSES, mass)):
+        for name in names:
+            getattr(model, name)[:] = factor * getattr(usual, name)
     mujoco.mj_setConst(model, data)  # what follows from masses
 
 
@@ -93,7 +92,7 @@ class Varied(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._speed[:] = drawn.push
         self._draws.begin(np.array([0]), np.array([seed]))
         self._vary(drawn.friction, drawn.mass)
-        put = {name: getattr(self._model, name).copy() for name in _VARIED}
+        put = {name: getattr(self._model, name).copy() for name in (*_FRICTIONS, *_MASSES)}
         given = self.env.reset(seed=seed, options=options)
         self._keep(put)
         self._vary(drawn.friction, drawn.mass)  # it may have another model now
