@@ -221,7 +221,8 @@ def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
     Units are standardised first, so that their scales don't say which directions are constant. If
     all are, one direction is left, and it is 0.
     """
-    mean, deviation = (getattr(latents, of)(axis=0, dtype=np.float64) for of in ("mean", "std"))
+    mean = latents.mean(axis=0, dtype=np.float64)
+    deviation = latents.std(axis=0, dtype=np.float64)
     magnitude = np.maximum(np.abs(latents).max(axis=0), deviation.max())
     factor = _inverse(deviation, deviation > np.finfo(np.float32).eps * magnitude)
     standardised = (latents - mean) * factor
@@ -259,17 +260,17 @@ def neighbours(encoder: BaseEncoder, held_out: HeldOut) -> Neighbours:
         np.stack(list(state(data.task, rows).values()), 1) for rows in (queries, references)
     )
     scale = reference_states.std(axis=0)
-    varies = np.ptp(reference_states, axis=0) > 0
+    varying = np.ptp(reference_states, axis=0) > 0
     index = NearestNeighbors(n_neighbors=min(_NEIGHBOURS, len(train)))
     index.fit(encoder.encode(references))
     latents = encoder.encode(queries)
     with threadpool_limits(1, "openmp"):  # of this thread: which of equally near ones depends on it
         nearest = index.kneighbors(latents, return_distance=False)
-    differences = (reference_states[nearest] - query_states[:, None])[..., varies] / scale[varies]
+    differences = (reference_states[nearest] - query_states[:, None])[..., varying] / scale[varying]
     squares = np.square(differences).mean(axis=1)
     sums, counts = held_out.sums(test, squares, np.ones((len(test), 1)))
     by_name = scores(bootstrap(lambda s, n: s / n, sums, counts))
-    names = np.array(list(state(data.task, references[:1])))[varies].tolist()
+    names = np.array(list(state(data.task, references[:1])))[varying].tolist()
     return Neighbours(
         mse=score(bootstrap(lambda s, n: s.mean(axis=-1) / n[..., 0], sums, counts)),
         dimensions=dict(zip(names, by_name, strict=True)),

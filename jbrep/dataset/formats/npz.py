@@ -71,11 +71,11 @@ def _opened(archive: zipfile.ZipFile, name: str) -> Iterator[_Stored]:
                 (1, 0): (2, np.lib.format.read_array_header_1_0),
                 (2, 0): (4, np.lib.format.read_array_header_2_0),
             }[np.lib.format.read_magic(file)]
-            length = file.read(width)
-            if int.from_bytes(length, "little") > _MOST_HEADER:  # NumPy would read it before
+            begins = file.read(width)
+            length = int.from_bytes(begins, "little")
+            if length > _MOST_HEADER:  # NumPy would read it before
                 raise ValueError
-            header = length + file.read(int.from_bytes(length, "little"))
-            shape, by_columns, dtype = read(io.BytesIO(header))
+            shape, by_columns, dtype = read(io.BytesIO(begins + file.read(length)))
             if dtype.hasobject:
                 raise InputError(
                     f"{archive.filename} has objects in {name}, which would have to be unpickled, "
