@@ -119,7 +119,14 @@ def test_the_end_says_what_is_true(looks):
 
 
 @pytest.mark.parametrize(
-    ("level", "said"), [(0.05, "95"), (0.05 / 3, "98.33"), (0.0004, "99.96"), (2.5e-6, "99.99975")]
+    ("level", "said"),
+    [
+        (0.05, "95"),
+        (0.05 / 3, "98.33"),
+        (0.0004, "99.96"),
+        (2.5e-6, "99.99975"),
+        (0.0, "99.9999999999"),  # a first look so early that its level is no float
+    ],
 )
 def test_no_level_of_an_interval_is_rounded_to_100_percent(looks, level, said):
     verdict, *_ = cell(looks[1][SEEDS][0], "face_direction", "dae-8")

@@ -31,6 +31,7 @@ EFFECTS = (  # of `jbrep.stats.power`
     "varies by an SD of 5, 10 or 20 % of training. Each by itself: claims before it, and runs that "
     "fail to learn, may stop a verdict."
 )
+_LEAST_LACKING = 1e-12  # of 1, in a level: floating-point numbers tell no more of it
 _KEPT = "gain over {over}, as a share of that on {baseline}"
 _HEADS = {  # of columns
     NOT_WORSE.name: "of {whose} gain",
@@ -193,8 +194,9 @@ def tested(verdict: Verdict) -> str:
 
 def deciding(verdict: Verdict) -> str:
     """The interval that decides, with its level: two digits at least of what it lacks of 100 %."""
-    digits = max(4, 1 - math.floor(math.log10(verdict.level)))
-    level = f"{100 * (1 - verdict.level):.{digits}g} %"
+    lacking = max(verdict.level, _LEAST_LACKING)
+    digits = max(4, 1 - math.floor(math.log10(lacking)))
+    level = f"{100 * (1 - lacking):.{digits}g} %"
     return f"{told(verdict.claim, verdict.interval)} at {level}"
 
 
