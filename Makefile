@@ -109,7 +109,7 @@ recipe: ## results/recipe/ anew: half an hour
 figure-7-sac figure-7-td3: ## results/figure-7-sac/ and -td3/ anew: an hour each
 figure-7-ddpg: ## results/figure-7-ddpg/ anew: half an hour
 cart-pole: ## results/cart-pole/ anew: half an hour
-cart-pole-settings: ## results/cart-pole-settings/ anew: three quarters of an hour
+cart-pole-settings: ## results/cart-pole-settings/ anew: half an hour
 cheetah-wide: ## results/cheetah-wide/ anew: forty minutes
 cheetah-plateau: ## results/cheetah-plateau/ anew: five to six hours
 cheetah-settings: ## results/cheetah-settings/ anew: an hour
