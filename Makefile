@@ -110,7 +110,7 @@ figure-7-sac figure-7-td3: ## results/figure-7-sac/ and -td3/ anew: an hour each
 figure-7-ddpg: ## results/figure-7-ddpg/ anew: half an hour
 cart-pole: ## results/cart-pole/ anew: half an hour
 cart-pole-settings: ## results/cart-pole-settings/ anew: half an hour
-cart-pole-often: ## results/cart-pole-often/ anew: half an hour
+cart-pole-often: ## results/cart-pole-often/ anew: forty minutes
 cheetah-wide: ## results/cheetah-wide/ anew: forty minutes
 cheetah-plateau: ## results/cheetah-plateau/ anew: five to six hours
 cheetah-settings: ## results/cheetah-settings/ anew: an hour and a quarter
