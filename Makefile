@@ -114,6 +114,7 @@ cart-pole-often: ## results/cart-pole-often/ anew: forty minutes
 cheetah-wide: ## results/cheetah-wide/ anew: forty minutes
 cheetah-plateau: ## results/cheetah-plateau/ anew: five to six hours
 cheetah-settings: ## results/cheetah-settings/ anew: an hour and a quarter
+cheetah-often: ## results/cheetah-often/ anew: two hours
 answer-move-to-position: ## results/answer-move-to-position/ anew: two hours
 answer-face-direction: ## results/answer-face-direction/ anew: an hour
 answer-move-from-origin answer-move-in-direction: ## results/answer-move-from-origin/ and -in-direction/ anew: an hour and a half each
