@@ -22,13 +22,15 @@ import pyarrow.parquet as pq
 import pytest
 from command import jbrep, mistake
 from foreign import GYRO, PITCH, RATE, TIMES, VOLTS, csv_rows, lerobot_folder, write_bag, write_csv
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from small import flip_bit
 
 from jbrep.collect import collect
 from jbrep.collect.derive import derive_view
 from jbrep.dataset import Dataset, DataSettings, Layout, ScaledDataset
+from jbrep.dataset.formats import bag_reader
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
 from jbrep.errors import InputError, Notice
@@ -663,6 +665,30 @@ def test_a_bag_with_a_database_that_computes_is_refused(told, made, is_squeezed,
     assert f"{told}: a bag has plain tables only" in mistake(
         "data", "import", path, "--out", tmp_path / "out"
     )
+
+
+@pytest.mark.parametrize(
+    ("kind", "compressed", "told"),
+    [
+        *(("bag", (each,), "over 40 bytes") for each in Writer1.CompressionFormat),
+        ("mcap", (CompressionMode.STORAGE, CompressionFormat.ZSTD), "over 1 times its size"),
+        ("db3", (CompressionMode.FILE, CompressionFormat.ZSTD), "over 1 times its size"),
+        ("db3", (CompressionMode.MESSAGE, CompressionFormat.ZSTD), "over 40 bytes"),
+    ],
+)
+def test_a_compressed_bag_is_refused_where_it_unpacks_to_too_much(
+    kind, compressed, told, tmp_path, monkeypatch
+):
+    path = tmp_path / ("walk.bag" if kind == "bag" else "walk")
+    write_bag(path, kind, compressed=compressed)
+    names = ("--observations", "/joint_states.position.*", "--actions", "/arm/command.data")
+    _, data = imported(path, *names, "--rate", "50", "--gap", "0.15")
+    assert data.episodes["length"].tolist() == [52, 47]
+    monkeypatch.setattr(bag_reader, "_MOST_AT_ONCE", 40)
+    monkeypatch.setattr(bag_reader, "_MOST_TIMES", 1)
+    refused = mistake("data", "import", path, "--out", tmp_path / "no")
+    assert f"{path.name} can't be read as a bag: " in refused
+    assert f"unpacks to {told}" in refused
 
 
 @pytest.mark.parametrize("field", ["string[5000] data", "std_msgs/Float64[5000] data"])

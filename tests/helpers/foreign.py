@@ -79,7 +79,7 @@ def lerobot_folder(folder, version="v3.0", **features):
     return folder
 
 
-def write_bag(path, kind, silent=(), joints=("hip", "knee"), count=0):
+def write_bag(path, kind, silent=(), joints=("hip", "knee"), count=0, compressed=()):
     """Joints at 100 Hz in changing order, commands at 10 Hz that pause, a count, and words.
 
     Messages of silent joints, by their numbers, have none.
@@ -90,6 +90,8 @@ def write_bag(path, kind, silent=(), joints=("hip", "knee"), count=0):
     else:
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
         writer, pack = Writer2(path, version=9, storage_plugin=plugin), store.serialize_cdr
+    if compressed:
+        writer.set_compression(*compressed)
     types = store.types
     stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
     first = {"seq": 0} if kind == "bag" else {}

@@ -3,9 +3,7 @@
 Each message is a row that has the numbers of its topic only, at the time when it was recorded.
 """
 
-import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,29 +11,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Nodetype
-from rosbags.rosbag2.reader import DirectoryReader, Reader
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-from rosbags.typesys import Stores, get_typestore
 
+from jbrep.dataset.formats.bag_reader import opened
 from jbrep.dataset.formats.episodes import digits_lost, label
 from jbrep.dataset.formats.flat import CHUNK
 from jbrep.dataset.formats.tables import Table
 from jbrep.dataset.layout import Layout
 from jbrep.envs.task import MAX_FEATURES
-from jbrep.errors import InputError, refusing
 from jbrep.records.record import MOST_WHOLE
 from jbrep.records.storage import check_plain
 
 _TIME = "time"
 _DEEPEST = 8  # messages in messages
 _PEEKED = 200  # messages of a topic by which its numbers are known
-_OF_ADDRESSES = "%?#"  # what SQLite takes for other characters, as rosbags gives it a path
-_COMPUTED = """
-SELECT type || ' ' || name FROM pragma_table_list WHERE type != 'table' UNION ALL
-SELECT 'computed column ' || c.name FROM pragma_table_list AS t, pragma_table_xinfo(t.name) AS c
-WHERE t.type = 'table' AND c.hidden
-"""  # which takes what time and memory it likes
 
 
 class _Message(NamedTuple):
@@ -59,7 +47,7 @@ def open_table(given: str) -> Table:
     """
     path, columns, unknown, late = Path(given), list[str](), list[str](), dict[str, str]()
     check_plain(path)
-    with _opened(path) as reader:
+    with opened(path) as reader:
         for topic in sorted(reader.topics):
             messages = islice(_messages(reader, {topic}), _PEEKED)
             known = dict.fromkeys(name for each in messages for name in each.numbers)
@@ -77,50 +65,6 @@ def open_table(given: str) -> Table:
         is_sparse=True,
         notes=(f"no numbers known in {', '.join(unknown)}",) if unknown else (),
     )
-
-
-class _Database(Sqlite3Reader):
-    """A database that has nothing but plain tables."""
-
-    def open(self) -> None:
-        """As in the class above.
-
-        Raises:
-            InputError: it has others, or SQLite would open another file.
-        """
-        path = str(self.path)
-        if any(each in path for each in _OF_ADDRESSES):
-            raise InputError(f"{path} can't be opened with any of {_OF_ADDRESSES} in it: rename it")
-        with closing(sqlite3.connect(f"file:{path}?immutable=1", uri=True)) as database:
-            if computed := database.execute(_COMPUTED).fetchone():
-                raise InputError(f"{path} has the {computed[0]}: a bag has plain tables only")
-        super().open()
-
-
-for _reader, _kind in ((Reader, ".db3"), (DirectoryReader, "sqlite3")):
-    _reader.STORAGE_PLUGINS = {**_reader.STORAGE_PLUGINS, _kind: _Database}
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[AnyReader]:
-    """A reader of a bag; types that the bag doesn't define are those of ROS 2."""
-    with refusing(f"{path} can't be read as a bag"):  # whatever damaged bags raise
-        store = get_typestore(Stores.ROS2_HUMBLE)
-        with AnyReader([path], default_typestore=store) as reader:
-            for name, (_, fields) in reader.typestore.fielddefs.items():
-                if sum(map(_parts, fields)) > MAX_FEATURES:
-                    has = f"{path} has messages {name} of more than {MAX_FEATURES:,} parts"
-                    raise InputError(f"{has}: record it without them")
-            yield reader
-
-
-def _parts(field: tuple[str, Any]) -> int:
-    """How many parts of a message rosbags makes code for, of a field: arrays of numbers are one."""
-    kind, of = field[1]
-    if kind != Nodetype.ARRAY:
-        return 1
-    (kind, of), count = of
-    return int(count) if kind == Nodetype.NAME or of[0] == "string" else 1
 
 
 def _messages(reader: AnyReader, topics: set[str]) -> Iterator[_Message]:
@@ -164,7 +108,7 @@ def _batches(
 ) -> Iterator[pa.RecordBatch]:
     """The messages with some of the numbers, some at a time; what is late is added, see `Table`."""
     known = {*schema.names}
-    with _opened(path) as reader:
+    with opened(path) as reader:
         topics = {t for t in reader.topics if any(name.startswith(f"{t}.") for name in names)}
         messages = (each for each in _messages(reader, topics) if each.numbers)
         while some := list(islice(messages, CHUNK)):
