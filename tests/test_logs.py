@@ -602,6 +602,62 @@ def test_messages_without_numbers_end_no_bag(tmp_path):
     assert "no numbers known in /rosout" in told
 
 
+@pytest.mark.parametrize(
+    ("header", "told"),
+    [
+        ("t,velocity [rad/s],cosine,sine,u", "'velocity' where Pendulum-v1 has 'cosine'"),
+        ("t,cosine,sine,velocity [deg/s],u", "'velocity' in deg/s, and Pendulum-v1 in rad/s"),
+        ("t,cosine,sine,velocity,u", "0.02 s apart, but steps of Pendulum-v1 take 0.05 s"),
+    ],
+)
+def test_a_log_in_another_order_units_or_clock_than_its_task_is_refused(header, told, tmp_path):
+    named = tmp_path / "names.toml"
+    named.write_text(
+        "[[features]]\nname = 'cosine'\n[[features]]\nname = 'sine'\n"
+        "[[features]]\nname = 'velocity'\nunit = 'rad/s'\n"
+    )
+    task = describe("Pendulum-v1", features=named)
+    path = tmp_path / "log.csv"
+    rows = "".join(f"{i / 50},1,0,0,{i % 2}\n" for i in range(20))
+    path.write_text(f"{header}\n{rows}")
+    layout = Layout(time="t", observations=(*re.findall(r"cosine|sine|velocity", header),))
+    with pytest.raises(InputError, match=re.escape(told)):
+        Dataset.from_file(tmp_path / "out", path, layout=layout.replace(actions=("u",)), task=task)
+
+
+def test_topics_of_other_clocks_are_no_pauses_and_a_folder_is_no_bag_of_ros_1(tmp_path):
+    path = write_bag(tmp_path / "walk", "mcap")
+    names = ("--observations", "/joint_states.position.*", "--actions", "/arm/command.data")
+    told, _ = imported(path, *names, "--rate", "50", "--gap", "0.15")
+    assert "pause" not in told  # commands come a tenth as often as joints
+    path.rename(path := path.with_suffix(".bag"))
+    assert "is a folder, and files of ROS 1 end in .bag: rename it" in mistake(
+        "data", "import", path, "--out", tmp_path / "no"
+    )
+
+
+def test_small_things_of_logs(tmp_path):
+    """Decimal commas in exponents, first lists that are empty, a large constant action."""
+    path = tmp_path / "a.csv"
+    path.write_text("t;a;u\n0;0,000e+00;0\n1;1,5e-01;1\n2;2,5E-1;0\n")
+    named = Layout(observations=("a",), actions=("u",), time="t")
+    data = Dataset.from_file(tmp_path / "a", path, layout=named)
+    assert data["observation"][:, 0].tolist() == [0, np.float32(0.15)]
+    table = pa.table({"t": [0, 1, 2, 3], "a": [None, [], [1.0, 2], [3.0, 4]], "u": [3e7] * 4})
+    pq.write_table(table, tmp_path / "b.parquet")
+    with pytest.raises(InputError, match="row 0: 'a' has an empty cell: fill it"):
+        Dataset.from_file(tmp_path / "b", tmp_path / "b.parquet", layout=named)
+    pq.write_table(table.slice(2), tmp_path / "c.parquet")
+    data = Dataset.from_file(tmp_path / "c", tmp_path / "c.parquet", layout=named)
+    assert data["observation"][0].tolist() == [1, 2]
+    assert data.task.action_low[0] < 3e7 < data.task.action_high[0]
+    path.write_text("t,a,u\n0,1,1\n,2,2\n")
+    with pytest.raises(InputError, match=r"'t' is empty, .* correct it, or leave the row out$"):
+        Dataset.from_file(tmp_path / "d", path, layout=named, missing="skip")
+    with pytest.raises(InputError, match=r"has no actions: .*; it has t, a, u$"):
+        Dataset.from_file(tmp_path / "e", path, layout=Layout(time="t"))
+
+
 def test_a_damaged_bag_is_refused(tmp_path):
     for name in ("a.bag", "a.mcap", "a.db3"):
         (tmp_path / name).write_bytes(b"nonsense" * 20)

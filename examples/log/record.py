@@ -4,7 +4,8 @@
 
 The robot is the environment that the model names; the policy needs onnxruntime and nothing of
 jbrep. A row of the log has what was observed, the action that followed and the reward of that; the
-last row of an episode has only what was observed after the last action.
+last row of an episode has only what was observed after the last action. An episode ends early where
+the environment ends it.
 """
 
 import argparse
@@ -25,11 +26,15 @@ def record(model: str, out: str, episodes: int = 100, steps: int = 1000) -> list
     """Write the log of some episodes; their returns."""
     session = onnxruntime.InferenceSession(model)
     said = json.loads(session.get_modelmeta().custom_metadata_map["jbrep"])
-    task = jbrep.describe(said["task"])
+    arguments = said["environment"].get("arguments", {})
+    task = jbrep.describe(said["task"], arguments)
     period, repeat = said["control_period"], said["action_repeat"]
+    if not period or said["history"] > 1:
+        raise SystemExit(f"{model} must act on single states, in steps of a known time")
+    offset = np.array([each["offset"] for each in said["observation"]])
     sensors = [f"{each['name']} [{each['unit']}]" for each in said["observation"]]
     motors = [f"action_{i}" for i in range(len(said["action"]["low"]))]
-    environment, returns = gymnasium.make(task.id, max_episode_steps=steps), []
+    environment, returns = gymnasium.make(task.id, max_episode_steps=steps, **arguments), []
     with Path(out).open("w", newline="") as file:
         log = csv.writer(file)
         log.writerow(["trial", "time [s]", *sensors, *motors, "reward"])
@@ -38,12 +43,15 @@ def record(model: str, out: str, episodes: int = 100, steps: int = 1000) -> list
             returns.append(0.0)
             for step in range(steps):
                 if step % repeat == 0:
-                    action = session.run(["action"], {"observation": np.float32(seen)[None]})[0][0]
+                    given = {"observation": np.float32(seen - offset)[None]}
+                    action = session.run(["action"], given)[0][0]
                 before = seen
-                seen, reward, *_ = environment.step(action)
+                seen, reward, is_over, *_ = environment.step(action)
                 log.writerow([trial, round(step * period, 6), *before, *action, np.float32(reward)])
                 returns[-1] += float(reward)
-            log.writerow([trial, round(steps * period, 6), *seen, *action, 0])
+                if is_over:
+                    break
+            log.writerow([trial, round((step + 1) * period, 6), *seen, *action, 0])
     environment.close()
     return returns
 

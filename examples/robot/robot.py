@@ -2,8 +2,9 @@
 
     python robot.py face_direction --port 9000 --in-step
 
-It keeps the task's rate, holding the last action where none came in time; --in-step waits for each
-answer instead, so that an episode is the one that the run itself would play.
+It keeps the task's rate: each step takes the newest action that has come, and counts as late where
+that answers an earlier step. --in-step waits for each answer instead, so that an episode is the one
+that the run itself would play.
 """
 
 import argparse
@@ -16,6 +17,8 @@ import numpy as np
 import jbrep
 from jbrep.rl.files import EVALUATION_SEED
 
+_PATIENCE = 5.0  # seconds to wait for an answer, in step
+
 
 def play(task: str, port: int, episode: int, steps: int | None, in_step: bool) -> float:
     """Play an episode of evaluation; its return."""
@@ -26,15 +29,13 @@ def play(task: str, port: int, episode: int, steps: int | None, in_step: bool) -
     period = described.timestep or 0.01
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.connect(("127.0.0.1", port))
-        link.settimeout(5.0 if in_step else period)
         due = time.monotonic()
         for step in range(described.max_episode_steps):
             link.send(struct.pack("<I", step) + observation.astype(np.float32).tobytes())
             due += period
-            try:
-                action = _answer(link, step if in_step else None)
-            except TimeoutError:
-                late += 1
+            until = time.monotonic() + _PATIENCE if in_step else due
+            action, is_late = _newest(link, step, until, action)
+            late += is_late
             taken = lanes.step(action[None])
             total += float(taken.reward[0])
             observation = taken.observation[0]
@@ -44,12 +45,19 @@ def play(task: str, port: int, episode: int, steps: int | None, in_step: bool) -
     return total
 
 
-def _answer(link: socket.socket, step: int | None) -> np.ndarray:
-    """The next action that comes; with a step, the next one that answers that step."""
+def _newest(
+    link: socket.socket, step: int, until: float, action: np.ndarray
+) -> tuple[np.ndarray, bool]:
+    """The answer to a step, or the newest action until then, and whether it is late."""
     while True:
-        answer = link.recv(65536)
-        if step is None or struct.unpack_from("<I", answer)[0] == step:
-            return np.frombuffer(answer, np.float32, offset=4)
+        link.settimeout(max(until - time.monotonic(), 1e-6))
+        try:
+            answer = link.recv(65536)
+        except TimeoutError:
+            return action, True
+        action = np.frombuffer(answer, np.float32, offset=4)
+        if struct.unpack_from("<I", answer)[0] == step:
+            return action, False
 
 
 def main() -> None:
@@ -61,7 +69,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help="of the episode, if fewer than the task's")
     parser.add_argument("--in-step", action="store_true")
     given = parser.parse_args()
-    play(given.task, given.port, given.episode, given.steps, given.in_step)
+    try:
+        play(given.task, given.port, given.episode, given.steps, given.in_step)
+    except ConnectionRefusedError:
+        raise SystemExit(f"no controller answers at port {given.port}: start it first") from None
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jbrep.dataset.formats.episodes import Source
+from jbrep.dataset.formats.episodes import CLOCKS, Source
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.errors import InputError, choose
@@ -43,7 +43,6 @@ _ALIKE = {  # what data that are imported together have in common
     "action_bounds": "has other bounds of actions than",
     "subtracted": "has other offsets of features subtracted than",
 }
-_CLOCKS = 0.01  # by which even clocks may differ
 
 
 def load_format(name: str) -> ModuleType:
@@ -144,7 +143,7 @@ def load_reader(given: str) -> ModuleType:
         raise InputError(f"unknown format '.{suffix}': choose one of {', '.join(_FILES)}")
     if exists(path / MANIFEST):
         raise InputError(f"{path} is a data set of jbrep's already: there is nothing to import")
-    if not is_file and suffix in _FILES:
+    if not exists(path) and suffix in _FILES:
         raise InputError(f"there is no file {path}")
     folders = (name for mark, name in _FOLDERS.items() if exists(path / mark))
     name = _FILES[suffix] if is_file else next(folders, "minari")
@@ -182,6 +181,6 @@ def _difference(one: Source, other: Source) -> str:
         if not np.array_equal(getattr(one, what), getattr(other, what)):
             return differs
     step, another = one.timestep, other.timestep
-    if step and another and not math.isclose(step, another, rel_tol=_CLOCKS):
+    if step and another and not math.isclose(step, another, rel_tol=CLOCKS):
         return "has another time from row to row than"
     return ""

@@ -7,7 +7,7 @@ import pyarrow as pa
 
 from jbrep.dataset.formats.episodes import label
 from jbrep.dataset.formats.flat import CHUNK
-from jbrep.dataset.formats.tables import Table, with_widths
+from jbrep.dataset.formats.tables import PEEKED, Table, with_widths
 from jbrep.errors import refusing
 
 
@@ -24,5 +24,5 @@ def table_of(frame: Any, name: str) -> Table:
     def batches(names: list[str]) -> Iterator[pa.RecordBatch]:
         yield from table.select(names).to_batches(CHUNK)
 
-    schema = with_widths(table.schema, next(iter(table.slice(0, 1).to_batches()), None))
+    schema = with_widths(table.schema, next(iter(table.slice(0, PEEKED).to_batches()), None))
     return Table(name, label(name), schema, batches, rows=table.num_rows)

@@ -43,6 +43,8 @@ def opened(path: Path) -> Iterator[AnyReader]:
     Raises:
         InputError: it can't be read, or is beyond a limit.
     """
+    if path.is_dir() and path.suffix == ".bag":
+        raise InputError(f"{path} is a folder, and files of ROS 1 end in .bag: rename it")
     refused = f"{path} can't be read as a bag"
     large = refusing(refused, (_TooLargeError,), told=first_line)
     with refusing(refused), large:  # and whatever damaged bags raise

@@ -65,7 +65,8 @@ class Clock:
             back, silent = step < 0, step > (self._layout.gap or np.inf)
             usual = usual or _usual(step)
             pauses = step >= _PAUSE * (usual or np.inf)
-            self._counts["pauses"] += int((pauses & ~begins & ~silent).sum())
+            if not (self._layout.gap or self._layout.rate):
+                self._counts["pauses"] += int((pauses & ~begins).sum())
             self._counts["back"] += int((back & ~begins).sum())
             self._counts["gaps"] += int((silent & ~begins).sum())
             numbers = number + np.cumsum(begins | back | silent)

@@ -30,6 +30,7 @@ ALIASES = {  # what others call the columns; the dotted and the last ones are Le
 ENDS = ("terminated", "truncated")
 WIDE = ("observation", "action", "next_observation", "final_observation")  # with many numbers a row
 WHOLE = ("episode", "step", "seed")
+CLOCKS = 0.01  # by which even clocks may differ and count as alike
 _IMAGE_AXES = 3  # height, width, colour
 
 
@@ -278,20 +279,26 @@ def flags(where: str, name: str, values: Array) -> NDArray[np.bool_]:
     return values.astype(bool)
 
 
-def check_names(name: str, columns: Iterable[str]) -> None:
+def check_names(name: str, roles: Iterable[str], columns: Iterable[str] = ()) -> None:
     """Make sure that there is what every data set needs.
+
+    Args:
+        name: of the source, for messages, as are its columns, unless they are named as roles.
+        roles: that columns have.
+        columns: all that there are.
 
     Raises:
         InputError: a column is missing, or nothing tells where an episode ends.
     """
-    columns = set(columns)
+    roles = set(roles)
     for needed in ("observation", "action"):
-        if needed not in columns:
+        if needed not in roles:
+            has = listed([*columns] or sorted(roles)) or "no columns"
             raise InputError(
                 f"{name} has no {needed}s: of a log name their columns, as in --actions torque "
-                f"--observations 'joint_*'; it has {listed(sorted(columns)) or 'no columns'}"
+                f"--observations 'joint_*'; it has {has}"
             )
-    if not columns & {*ENDS, "episode", "step"}:
+    if not roles & {*ENDS, "episode", "step"}:
         raise InputError(
             f"{name} doesn't tell where an episode ends: give it terminations and truncations, or "
             "the number of the episode in each row; of a log name the column of times or episodes "

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from jbrep.dataset.formats.episodes import label
 from jbrep.dataset.formats.parquet import batches_of, check_sizes, reading
-from jbrep.dataset.formats.tables import NAMES, Table, width, with_offsets, with_widths
+from jbrep.dataset.formats.tables import NAMES, PEEKED, Table, width, with_offsets, with_widths
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
@@ -58,7 +58,7 @@ def open_table(given: str) -> Table:
     for path in paths:
         with reading(path), pq.ParquetFile(path) as file:
             check_sizes(str(path), file.metadata, file.schema_arrow)
-            schema = schema or with_widths(file.schema_arrow, next(file.iter_batches(1), None))
+            schema = schema or with_widths(file.schema_arrow, next(file.iter_batches(PEEKED), None))
             if lacking := [n for n in schema.names if n not in file.schema_arrow.names]:
                 raise InputError(f"{path} has no column {lacking[0]!r}, unlike {paths[0].name}")
             rows += file.metadata.num_rows

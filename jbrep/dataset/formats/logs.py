@@ -195,10 +195,10 @@ class _Reader:
         if values.dtype.kind != "f" or (self._may_miss and role in (*WIDE, "reward")):
             return
         if len(wrong := np.flatnonzero(~np.isfinite(values))):
-            raise InputError(
-                f"{self._at(first + int(wrong[0]))}: {leaf.name!r} is empty, or no finite number: "
-                "correct it, leave the row out, or give --missing"
-            )
+            told = f"{self._at(first + int(wrong[0]))}: {leaf.name!r} is empty, or no finite number"
+            if role in (*WIDE, "reward"):
+                raise InputError(f"{told}: correct it, leave the row out, or give --missing")
+            raise InputError(f"{told}: correct it, or leave the row out")
 
     def _check_whole(self, leaf: Leaf, column: pa.Array, first: int) -> None:
         """Refuse whole numbers that floats lose digits of, as those beside empty cells become."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.formats.episodes import ENDS, label
 from jbrep.dataset.formats.flat import CHUNK, per_episode
-from jbrep.dataset.formats.tables import Table, with_offsets, with_widths
+from jbrep.dataset.formats.tables import PEEKED, Table, with_offsets, with_widths
 from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import MAX_FEATURES, Task
 from jbrep.errors import DamageError, InputError, first_line, refusing
@@ -66,7 +66,7 @@ def open_table(given: str) -> Table:
     with reading(path), pq.ParquetFile(path) as file:
         metadata, schema = file.metadata, file.schema_arrow
         check_sizes(given, metadata, schema)
-        schema = with_widths(schema, next(file.iter_batches(1), None))
+        schema = with_widths(schema, next(file.iter_batches(PEEKED), None))
         known = _checksums(path, metadata.metadata or {})
         task = _own_task(schema, metadata.metadata) if known else None
     for name, offset in zip(task.feature_names, task.offset, strict=True) if task else ():

@@ -22,6 +22,7 @@ from jbrep.text import words
 
 Array = NDArray[Any]
 
+PEEKED = 200  # rows by which lists are known
 UNIT = b"unit"  # in a field's metadata
 NAMES, OFFSETS = b"names", b"offsets"  # of its numbers, in lines: names, and what they lack already
 _ACTION = re.compile(r"actions?(_\d+)?")
@@ -116,13 +117,14 @@ def _own_leaves(schema: pa.Schema) -> Iterator[Leaf]:
 
 
 def with_widths(schema: pa.Schema, first: pa.RecordBatch | None) -> pa.Schema:
-    """The schema of a file: lists as long as they are in the first row, and units alone."""
+    """The schema of a file: lists as long as the first one that has numbers, and units alone."""
     for i, each in enumerate(schema):
         units = {name: text for name, text in (each.metadata or {}).items() if name == UNIT}
         schema = schema.set(i, each := each.with_metadata(units))
         if pa.types.is_list(each.type) or pa.types.is_large_list(each.type):
-            size = pc.list_value_length(first.column(i))[0].as_py() if first else 0
-            schema = schema.set(i, each.with_type(pa.list_(each.type.value_type, size or 0)))
+            sizes = pc.list_value_length(first.column(i)).to_pylist() if first else ()
+            size = next(filter(None, sizes), 0)
+            schema = schema.set(i, each.with_type(pa.list_(each.type.value_type, size)))
     return schema
 
 
@@ -167,7 +169,7 @@ def roles_of(table: Table, layout: Layout) -> Roles:
     if layout.observations:
         roles["next_observation"] = _after(table, leaves, roles["observation"])
     roles = {role: some for role, some in roles.items() if some}
-    check_names(name, [*roles, *(["step"] if layout.time or layout.length else [])])
+    check_names(name, [*roles, *(["step"] if layout.time or layout.length else [])], names)
     for role, some in roles.items():
         _check_types(table, role, some, named=bool(layout.actions))
     return roles

@@ -1,5 +1,6 @@
 """Writing a data set of episodes that were made elsewhere: one pass to see them, one to write."""
 
+import math
 import warnings
 from collections import Counter
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from gymnasium import spaces
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from jbrep.dataset.formats.episodes import ENDS, Incoming, Source, single
+from jbrep.dataset.formats.episodes import CLOCKS, ENDS, Incoming, Source, single
 from jbrep.dataset.formats.missing import count_missing, without_missing
 from jbrep.dataset.manifest import Manifest, commit, new_manifest, write_manifest
 from jbrep.dataset.rewards import reward_function, with_hash, without_range
@@ -77,6 +78,8 @@ def write(
     try:
         with unfinished(folder) as partial:
             missing = missing or (task.missing if task else "") or ""
+            if task:
+                _check_alike(source, task)
             survey = _survey(source, missing)
             fitting = _fitting(source, survey, task or source.task)
             fitting = with_features(fitting, features) if features else fitting
@@ -162,6 +165,32 @@ def _survey(source: Source, missing: str) -> _Survey:
     return _Survey(lengths, sizes[0], low, high, signals)
 
 
+def _check_alike(source: Source, task: Task) -> None:
+    """Refuse features that are named as the task's but are others, and another clock.
+
+    Raises:
+        InputError: features of its names at other places or in other units, or steps of another
+            length.
+    """
+    for own, each in zip(task.features, source.features, strict=False):
+        if each.name != own.name and each.name in task.feature_names:
+            raise InputError(
+                f"{source.name} has {each.name!r} where {task.name} has {own.name!r}: name the "
+                f"observations in the order of jbrep env {task.name}"
+            )
+        if each.name == own.name and each.unit and own.unit and each.unit != own.unit:
+            raise InputError(
+                f"{source.name} has {each.name!r} in {each.unit}, and {task.name} in {own.unit}: "
+                "bring it to that unit"
+            )
+    step, expected = source.timestep, task.timestep
+    if step and expected and not math.isclose(step, expected, rel_tol=CLOCKS):
+        raise InputError(
+            f"rows of {source.name} are {step:.4g} s apart, but steps of {task.name} take "
+            f"{expected:.4g} s: give --rate {1 / expected:.6g}"
+        )
+
+
 def _fitting(source: Source, survey: _Survey, task: Task | None) -> Task:
     """The task with nothing of its states, or one made from the data alone."""
     if task is None:
@@ -209,9 +238,9 @@ def _from_data(source: Source, survey: _Survey) -> Task:
 
 def _action_bounds(source: Source, survey: _Survey) -> tuple[Array, Array]:
     """Those given; the extrema of the data where there are none, which a constant is amid."""
-    constant = survey.low == survey.high
-    low = np.where(constant, survey.low - 1, survey.low).astype(np.float64)
-    high = np.where(constant, survey.high + 1, survey.high).astype(np.float64)
+    beside = np.where(survey.low == survey.high, np.fmax(1, np.spacing(abs(survey.low))), 0)
+    low = survey.low - beside.astype(np.float64)
+    high = survey.high + beside.astype(np.float64)
     if source.action_bounds is None:
         return low, high
     given = (np.asarray(ends, np.float32).astype(np.float64) for ends in source.action_bounds)
