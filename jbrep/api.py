@@ -35,10 +35,12 @@ class Agent(NamedTuple):
     Attributes:
         folder: of the run.
         record: what run.json says: settings, status, seconds.
+        encoder: of the agent, if it is a user's own object.
     """
 
     folder: Path
     record: "RunRecord"
+    encoder: Any = None
 
     @property
     def returns(self) -> "NDArray[np.float64]":
@@ -54,7 +56,7 @@ class Agent(NamedTuple):
         """What it has learned, as a function of observations."""
         from jbrep.rl.controller import load_policy
 
-        return load_policy(self.folder)
+        return load_policy(self.folder, self.encoder)
 
     def __repr__(self) -> str:
         from jbrep.rl.files import FINISHED
@@ -357,7 +359,7 @@ def train(
     with closing(Bar(run.steps, f"{algorithm} on {job.encoder.name}")) as bar:
         session = Session(bar.show, stop=stop, writers=writers, keep_checkpoint=True)
         ((_, record),) = train_jobs([job], session)
-    return Agent(job.folder, record)
+    return Agent(job.folder, record, None if isinstance(encoder, str | Path) else encoder)
 
 
 def study(

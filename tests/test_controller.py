@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import jbrep
 from jbrep.encoders import find
 from jbrep.envs.description import describe
 from jbrep.envs.lanes import Lanes
@@ -128,6 +129,9 @@ def test_reading_a_policy_takes_little_and_leaves_random_numbers_alone():
     assert random[0] == random[1]
 
 
+SEEN = [0.0, 1.0, 0.0]
+
+
 def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
     class Doubled(torch.nn.Module):
         def forward(self, rows):
@@ -135,10 +139,12 @@ def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
 
     task, encoder = describe("Pendulum-v1", max_episode_steps=20), Doubled()
     quick = {"steps": 64, "evaluation_episodes": 1, "final_episodes": 1}
-    train(Run.of(task, "a2c", encoder=encoder, **quick), tmp_path / "own")
-    assert load_policy(tmp_path / "own", encoder)([0.0, 1.0, 0.0]).shape == (1,)
-    with pytest.raises(InputError, match="a run on a Python object needs it again"):
+    agent = jbrep.train(task, tmp_path / "own", algorithm="a2c", encoder=encoder, **quick)
+    assert load_policy(tmp_path / "own", encoder)(SEEN) == agent.policy(SEEN)
+    with pytest.raises(InputError, match=r"needs it again, as in jbrep\.load_policy"):
         load_policy(tmp_path / "own")
+    train(Run.of(task, "a2c", **quick), tmp_path / "full")
+    assert load_policy(tmp_path / "full/policy.zip")(SEEN) == load_policy(tmp_path / "full")(SEEN)
     shipped = find_shipped(describe("face_direction"))
     controller = load_policy(shipped)
     assert repr(controller) == "Controller(face_direction: 16 numbers to 1, symmetry)"

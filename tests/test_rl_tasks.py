@@ -182,6 +182,27 @@ def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
     assert not (tmp_path / RUN).exists()
 
 
+@pytest.mark.parametrize("algorithm", ["a2c", "sac"])  # by either trainer
+def test_what_was_learned_outlives_an_environment_that_fails(algorithm, tmp_path, monkeypatch):
+    run = Run.of(task=CART, algorithm=algorithm, steps=160, preset="modern", **ONE_EACH)
+    session = Session(save_every=0, keep_checkpoint=True)
+    whole = train(run, tmp_path / "whole", session)
+    count, step = iter(range(1 << 20)), Lanes.step
+
+    def failing(lanes, actions):
+        if next(count) == 60:
+            raise EnvironmentFailedError("the cable is loose", 0)
+        return step(lanes, actions)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Lanes, "step", failing)
+        with pytest.raises(InputError, match=r"is loose; .* goes on from its last checkpoint"):
+            train(run, tmp_path / "run", session)
+    assert not (tmp_path / "run" / RUN).exists()
+    assert load_run(tmp_path / "run").step > 0
+    assert train(run, tmp_path / "run", session).policy_sha256 == whole.policy_sha256
+
+
 def test_an_environment_that_is_not_reproducible(tmp_path):
     """The command says so at its start; a run that was stopped isn't resumed to something else."""
     rl = ("rl", "--task", cart.ID, "--env", "drifts=true", "--algorithm", "a2c", "--steps", 80)

@@ -82,6 +82,8 @@ def test_a_folder_with_other_things_is_no_search(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     told = mistake("tune", "--task", "face_direction", "--out", tmp_path)
     assert "holds other things, such as thesis.txt" in told
+    told = mistake("tune", "--task", "face_direction", "--seeds", 1 << 31, "--out", tmp_path / "a")
+    assert "seeds is 2,147,483,648: it must be from 1 to 1,000" in told
 
 
 def test_weights_and_biases_gets_what_tensorboard_gets(tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """What policies do."""
 
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -267,10 +268,9 @@ def _find(policy: str, task: "Task | None", encoder: str | None, zip_file: _Zip)
     """The policy of a run, by name, or in a zip file."""
     from jbrep.encoders import find
     from jbrep.play import sources
-    from jbrep.records.storage import exists
 
     path, folder = Path(policy), sources.run_folder(policy)
-    is_folder = exists(path) and path.is_dir()
+    is_folder = path.is_dir()
     is_zip = not (sources.is_by_name(policy) or sources.is_trained(policy) or is_folder)
     if not is_zip and (unused := [name for name, given in zip_file._asdict().items() if given]):
         raise InputError(f"--{unused[0]} is for zip files from elsewhere: leave it out")
@@ -283,7 +283,7 @@ def _find(policy: str, task: "Task | None", encoder: str | None, zip_file: _Zip)
     if sources.is_by_name(policy):
         player = sources.find_player(policy, task)
         return player.with_reconstruction(find(encoder, player.task)) if encoder else player
-    if not exists(path):
+    if not zipfile.is_zipfile(path):
         raise InputError(
             f"no policy at {policy}: a folder of jbrep rl is needed, a zip file of "
             f"stable-baselines3, or a name: {sources.policy_names()}"

@@ -1,6 +1,7 @@
 """What policies do, as tables: how the motor turns, and where the robot goes."""
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -10,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.envs.task import Array, Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, Notice
 from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.player import Player
 from jbrep.play.sources import find_player, find_untrained, is_by_name, run_folder
-from jbrep.rl.files import runs_below
+from jbrep.rl.files import FINISHED, read_run, runs_below
+from jbrep.text import counted
 
 SPEEDS = np.linspace(-180, 180, 73)  # edges of the bins of the motor's velocity [rad/s]
 FIGURES = ("motor_velocity", "positions")  # that show it, by name
@@ -104,7 +106,14 @@ def _runs(source: str) -> list[Path]:
     """The run that a source names, or the finished ones below a folder; none of a name."""
     if folder := run_folder(source):
         return [folder]
-    return [] if is_by_name(source) else runs_below(Path(source))
+    if is_by_name(source):
+        return []
+    ended = runs_below(Path(source))
+    finished = [run for run in ended if read_run(run).status == FINISHED]
+    if left := len(ended) - len(finished):
+        told = f"{counted(left, 'run')} below {source} failed, and has no policy: left out"
+        warnings.warn(told, Notice, stacklevel=2)
+    return finished
 
 
 def _shared(player: Player, shared: Task | None) -> Task:

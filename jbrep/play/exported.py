@@ -52,6 +52,7 @@ def exported_player(path: Path, task: Task | None = None) -> Player:
     """
     session, said = read_exported(path)
     known = task or said.environment
+    check_same(known, said.environment, str(path))
     ends = session.get_inputs(), session.get_outputs()
     if any(len(end) != 1 or len(end[0].shape) != 2 for end in ends):
         raise InputError(f"{path} isn't a policy that jbrep policy export wrote")
@@ -62,7 +63,6 @@ def exported_player(path: Path, task: Task | None = None) -> Player:
             f"{path} takes {sizes[0]} numbers and gives {sizes[1]}, but {known.name} observes "
             f"{known.size} and acts by {known.action_size}: give its --task"
         )
-    check_same(known, said.environment, str(path))
 
     def act(observation: Array) -> NDArray[Any]:
         with refusing(f"{path} can't be run", told=first_line):

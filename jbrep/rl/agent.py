@@ -2,6 +2,7 @@
 
 import random
 import textwrap
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from operator import attrgetter
@@ -24,6 +25,7 @@ from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import Actor, Outcome, held, joined, whole_outcome
 from jbrep.envs.task import Array, Task
+from jbrep.errors import Notice
 from jbrep.records.container import Tensors
 from jbrep.records.record import to_plain
 from jbrep.rl.files import EVALUATION_SEED
@@ -106,19 +108,22 @@ def make_agent(
     if hyperparameters.noise:
         size = np.prod(env.action_space.shape or (), dtype=int)
         of_class["action_noise"] = hyperparameters.noise.make(int(size), episode_steps)
-    agent: Any = sb3_class(algorithm)(
-        "MlpPolicy",
-        env,
-        seed=seed,
-        device="cpu",
-        policy_kwargs={
-            **of_policy,
-            "net_arch": to_plain(hyperparameters.net_arch),
-            "activation_fn": ACTIVATIONS[of_policy["activation_fn"]],
-            "optimizer_kwargs": {"fused": True, **of_adam},  # same Adam, less overhead
-        },
-        **of_class,
-    )
+    with warnings.catch_warnings(record=True) as told:
+        agent: Any = sb3_class(algorithm)(
+            "MlpPolicy",
+            env,
+            seed=seed,
+            device="cpu",
+            policy_kwargs={
+                **of_policy,
+                "net_arch": to_plain(hyperparameters.net_arch),
+                "activation_fn": ACTIVATIONS[of_policy["activation_fn"]],
+                "optimizer_kwargs": {"fused": True, **of_adam},  # same Adam, less overhead
+            },
+            **of_class,
+        )
+    for each in told:
+        warnings.warn(one_line(each.message), Notice, stacklevel=2)
     for _, part in trained_parts(agent):
         if isinstance(part, torch.optim.Optimizer):
             allocate_adam_state(part)

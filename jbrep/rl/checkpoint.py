@@ -235,10 +235,9 @@ class CheckpointFile:
         if settings.is_extended_by(self._settings) and not settings.schedules:
             settings = self._settings
         if others := settings.differing(self._settings) or versions:
-            raise InputError(
-                f"{self.path} belongs to another configuration: {others}; choose another folder, "
-                "or delete the file to start over"
-            )
+            told = f"{self.path} belongs to another configuration: {others}; choose another folder"
+            has_ended = exists(self.path.with_name(RUN))  # with fewer steps, which need the file
+            raise InputError(told if has_ended else f"{told}, or delete the file to start over")
         self._history.resume(header)
         return Snapshot(tensors, dict(header.counters))
 

@@ -18,7 +18,7 @@ from jbrep.envs.view import Window
 from jbrep.errors import DamageError, InputError, choose, first_line, listed
 from jbrep.records.container import Tensors
 from jbrep.records.storage import exists
-from jbrep.rl.files import ENCODER, POLICY, RUN, read_finished
+from jbrep.rl.files import ENCODER, POLICY, POLICY_ZIP, RUN, is_run, read_finished
 from jbrep.rl.normalization import CLIP, Statistics
 from jbrep.rl.policy_file import PolicyFile, read
 from jbrep.rl.run_settings import RunSettings
@@ -272,6 +272,7 @@ def load_policy(source: str | Path, encoder: Any = None) -> Controller:
         DamageError: a file isn't what was written.
     """
     path = Path(source)
+    path = path.parent if path.name == POLICY_ZIP and is_run(path.parent) else path
     if path.is_file():
         file = read(path)
         return _of_file(file, file.encoder())

@@ -16,7 +16,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.encoders import Encoder, save
 from jbrep.envs.infos import by_name
-from jbrep.envs.lanes import Lanes, lanes_at_once
+from jbrep.envs.lanes import EnvironmentFailedError, Lanes, lanes_at_once
 from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError
 from jbrep.machine import cores
@@ -289,20 +289,30 @@ class Job:
         """Training steps so far, in control steps."""
         return self.settings.control_steps(agent.num_timesteps)
 
-    def end(self, agent: BaseAlgorithm, failure: str) -> RunRecord:
+    def end(
+        self, agent: BaseAlgorithm, failed: Exception | None, keep_checkpoint: bool
+    ) -> RunRecord:
         """Write the run's files.
 
         Args:
             agent: trained; the policy of a run that failed isn't kept.
-            failure: why it failed; empty if it didn't. Where a run went on after fewer steps, what
-                it had left by then stays, and nothing is written.
+            failed: why; None if it didn't. Where a run went on after fewer steps, what it had left
+                by then stays, and nothing is written.
+            keep_checkpoint: whether the last checkpoint outlives the run.
 
         Returns:
             The contents of run.json; or what they would be.
+
+        Raises:
+            InputError: the environment failed after a checkpoint that is to be kept, which leaves
+                the run as one that was stopped.
         """
         folder, history = self.folder, self.history
+        failure = "" if failed is None else str(failed)
         if failure and exists(folder / RUN):
             return self._record(agent, failure, read_run(folder).tables, b"")
+        if isinstance(failed, EnvironmentFailedError) and keep_checkpoint:
+            self._check_lost(failed)
         (folder / RUN).unlink(missing_ok=True)  # of fewer steps, before its files change
         parts = agent.policy, self.run.task, self.encoder, self.settings
         trained = Trained(*parts, None, statistics_of(agent), action_repeat(agent))
@@ -319,6 +329,14 @@ class Job:
         result = self._record(agent, failure, tables, policy)
         result.write(folder / RUN)  # last: the run has ended where it exists
         return result
+
+    def _check_lost(self, failed: EnvironmentFailedError) -> None:
+        """Raise what ends a run without ending what it has learned, if there is a checkpoint."""
+        if exists(self.folder / CHECKPOINT):
+            goes_on = "the same command goes on from its last checkpoint"
+            played = "its last checkpoint can be played (jbrep evaluate-policy) and exported"
+            then = goes_on if self.run.task.reproducible else played
+            raise InputError(f"{failed}; of the run in {self.folder}, {then}") from failed
 
     def _record(
         self, agent: BaseAlgorithm, failure: str, tables: Mapping[str, str], policy: bytes

@@ -105,7 +105,7 @@ def run_encoder(folder: Path, settings: RunSettings) -> BaseEncoder:
         return make(settings.encoder_code, settings.environment)
     raise InputError(
         f"no {ENCODER} in {folder}: a run on a Python object needs it again, as in "
-        "load_run(folder, encoder)"
+        "jbrep.load_policy(folder, encoder)"
     )
 
 

@@ -78,22 +78,22 @@ def _train(job: Job, session: Session) -> RunRecord:
         env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
         job.prepare(agent, session.writers)
         job.share(_env(agent).lanes)
-        failure = _learn(agent, settings.agent_steps, follower)
-        return job.end(agent, failure)
+        failed = _learn(agent, settings.agent_steps, follower)
+        return job.end(agent, failed, session.keep_checkpoint)
 
 
-def _learn(agent: BaseAlgorithm, steps: int, callback: BaseCallback) -> str:
-    """Train up to that step; why training failed, or nothing."""
+def _learn(agent: BaseAlgorithm, steps: int, callback: BaseCallback) -> Exception | None:
+    """Train up to that step; why training failed, if it did."""
     try:
         with unchecked_distributions():
             agent.learn(steps, callback=callback)
     except (DivergedError, EnvironmentFailedError) as error:
-        return str(error)
+        return error
     except NonFiniteActionError:
-        return ACTIONS_NOT_FINITE
+        return DivergedError(ACTIONS_NOT_FINITE)
     finally:
         agent.logger.close()
-    return ""
+    return None
 
 
 class _Follower(BaseCallback):

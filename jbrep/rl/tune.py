@@ -25,6 +25,7 @@ from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.trainers import train_jobs
 
 SEARCH, BEST = "search.json", "best.toml"
+_MOST_SEEDS = 1_000
 _CHOICES: dict[str, list[Any]] = {
     "batch_size": [64, 128, 256, 512],
     "gamma": [0.9, 0.95, 0.98, 0.99, 0.995, 0.999],
@@ -93,6 +94,9 @@ def tune(
         StoppedError: `stop` was true.
     """
     settings = run.settings(run.find_encoder())
+    if not 1 <= seeds <= _MOST_SEEDS:
+        raise InputError(f"seeds is {seeds:,}: it must be from 1 to {_MOST_SEEDS:,}")
+    run.replace(seed=run.seed + seeds - 1)  # whose seed must be possible, too
     if settings.steps <= settings.learns_from:
         raise InputError(
             f"steps is {settings.steps:,}, and {settings.learner} learns from step "

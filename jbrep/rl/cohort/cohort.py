@@ -14,7 +14,7 @@ from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.task import Array
 from jbrep.records.container import without
 from jbrep.rl.agent import training_seed
-from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, LANES, Snapshot
+from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, LANES, DivergedError, Snapshot
 from jbrep.rl.cohort import get_algorithm
 from jbrep.rl.cohort.algorithm import Batch, Losses
 from jbrep.rl.cohort.member import Member
@@ -158,7 +158,7 @@ class Cohort:
         """Let members fail whose actions aren't finite; they do nothing in this step."""
         wrong = ~np.isfinite(actions)
         for number in np.flatnonzero(wrong.any((1, 2))).tolist():
-            self.members[number].fail(ACTIONS_NOT_FINITE)
+            self.members[number].fail(DivergedError(ACTIONS_NOT_FINITE))
         actions[wrong] = 0
 
     def _log_losses(self, losses: Sequence[Losses]) -> None:
@@ -209,7 +209,7 @@ class Cohort:
         """Let each member that hasn't failed play its policy."""
         self.write_to_agents()
         for member in self.members:
-            if not member.failure:
+            if not member.failed:
                 member.evaluate(evaluation)
 
     def evaluate_amid(self) -> None:
@@ -232,7 +232,7 @@ class Cohort:
     @property
     def failed(self) -> list[Member]:
         """Those that can't go on."""
-        return [member for member in self.members if member.failure]
+        return [member for member in self.members if member.failed]
 
     @property
     def goes_on(self) -> bool:
@@ -250,7 +250,7 @@ class Cohort:
         It has the memory of their replay buffers, which aren't in the snapshots.
         """
         self.write_to_agents()
-        going = [number for number, member in enumerate(self.members) if not member.failure]
+        going = [number for number, member in enumerate(self.members) if not member.failed]
         members = [self.members[number] for number in going]
         snapshots = [self.take(member) for member in members]
         for snapshot in snapshots:

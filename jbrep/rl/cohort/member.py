@@ -22,7 +22,7 @@ from jbrep.envs.task import Array
 from jbrep.records.container import Tensors, without
 from jbrep.rl import checkpoint
 from jbrep.rl.agent import Spaces, make_agent
-from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE, Snapshot
+from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE, DivergedError, Snapshot
 from jbrep.rl.files import Episode
 from jbrep.rl.job import Job
 from jbrep.rl.noise import Memory, Noise, beginning
@@ -49,13 +49,14 @@ class Member:
     Attributes:
         agent: without a replay buffer.
         random: its random numbers.
-        failure: why it failed; empty while it hasn't.
+        failed: why; None while it hasn't.
     """
 
     def __init__(self, job: Job, writers: Sequence[KVWriter]):
         run, settings, chosen = job.run, job.settings, job.settings.hyperparameters
         small = without_buffer(settings.algorithm, chosen.replace(noise=None))
-        self.job, self.failure = job, ""
+        self.job = job
+        self.failed: Exception | None = None
         env = DummyVecEnv([lambda: Spaces(*agent_spaces(run.task, job.encoder))])
         normalizing = normalized(env) if chosen.normalize else env
         self.agent: Any = make_agent(settings.algorithm, small, normalizing, run.seed)
@@ -124,22 +125,22 @@ class Member:
         for name, value in losses.items():
             self.agent.logger.record(f"train/{name}", value)
             if not math.isfinite(value):
-                self.fail(f"train/{name} is {value}")
+                self.fail(DivergedError(f"train/{name} is {value}"))
         if not math.isfinite(weights):
-            self.fail(WEIGHTS_NOT_FINITE)
+            self.fail(DivergedError(WEIGHTS_NOT_FINITE))
 
     def evaluate(self, evaluation: Callable[[Job, BaseAlgorithm], None]) -> None:
         """Let an evaluation of its job's play its agent's policy."""
         try:
             evaluation(self.job, self.agent)
         except NonFiniteActionError:
-            self.fail(ACTIONS_NOT_FINITE)
+            self.fail(DivergedError(ACTIONS_NOT_FINITE))
         except EnvironmentFailedError as error:
-            self.fail(str(error))
+            self.fail(error)
 
-    def fail(self, reason: str) -> None:
+    def fail(self, reason: Exception) -> None:
         """Note why it can't go on; the first reason is kept."""
-        self.failure = self.failure or reason
+        self.failed = self.failed or reason
 
     def take(self) -> Snapshot:
         """Everything of its own that decides how its training continues."""

@@ -73,7 +73,7 @@ def _train(begun: list[_Begun], session: Session) -> Iterator[Ended]:
             cohort.evaluate_amid()
         while cohort.goes_on:
             if cohort.failed:
-                yield from map(_end, cohort.failed)
+                yield from (_end(member, session) for member in cohort.failed)
                 cohort, snapshots = cohort.survivors()
                 cohort.restore(snapshots)
             _tell(cohort, session)
@@ -87,11 +87,11 @@ def _train(begun: list[_Begun], session: Session) -> Iterator[Ended]:
             _write(cohort)
         cohort.evaluate(Job.final_evaluation)
         _tell(cohort, session)
-        yield from map(_end, cohort.members)
+        yield from (_end(member, session) for member in cohort.members)
     except EnvironmentFailedError as error:
-        cohort.member_of(error.lane).fail(str(error))
-        yield from map(_end, cohort.failed)
-        others = [member.job.anew() for member in cohort.members if not member.failure]
+        cohort.member_of(error.lane).fail(error)
+        yield from (_end(member, session) for member in cohort.failed)
+        others = [member.job.anew() for member in cohort.members if not member.failed]
     finally:
         cohort.close()
         for member in everyone:
@@ -118,10 +118,10 @@ def _save(cohort: Cohort, session: Session) -> None:
 def _write(cohort: Cohort) -> None:
     cohort.write_to_agents()
     for member in cohort.members:
-        if not member.failure:
+        if not member.failed:
             member.job.checkpoint.write(cohort.take(member))
 
 
-def _end(member: Member) -> Ended:
+def _end(member: Member, session: Session) -> Ended:
     """Write what a member leaves; its agent has its last weights."""
-    return member.job, member.job.end(member.agent, member.failure)
+    return member.job, member.job.end(member.agent, member.failed, session.keep_checkpoint)
