@@ -455,7 +455,7 @@ def test_the_robot_is_the_heaviest_of_free_bodies(monkeypatch):
     assert kinds(made(monkeypatch, bodies=PUCK + BOT))[:14] == other + free
     task = made(monkeypatch, bodies=BOT + PUCK)
     assert kinds(task)[:14] == free + other
-    with pytest.raises(InputError, match="its robot isn't the only free body of MuJoCo's"):
+    with pytest.raises(InputError, match="it isn't the only free body in MuJoCo"):
         check_invariant(make_coordinates(task, "symmetry"))
 
 
@@ -520,12 +520,63 @@ def test_a_task_whose_features_say_nothing():
         make_coordinates(plain, "symmetry")
 
 
+def test_parts_that_would_have_a_features_name_have_another():
+    """MuJoCo's users name the numbers of a velocity as a part of `body` does."""
+    names = {f"velocity_{axis}": f"velocity.{axis}" for axis in "xyz"}
+    named = tuple(each.replace(name=names.get(each.name, each.name)) for each in TASK.features)
+    rows = states(TASK)
+    for system in ("coordinates", "symmetry"):
+        usual, other = (
+            make_coordinates(TASK, system),
+            make_coordinates(TASK.replace(features=named), system),
+        )
+        assert "velocity.body.x" in other.names
+        np.testing.assert_array_equal(other.forward(rows), usual.forward(rows))
+        np.testing.assert_array_equal(other.forward(rows[0]), usual.forward(rows[0]))
+    spoiled = tuple(
+        each.replace(name="velocity") if each.name == "velocity.body" else each
+        for each in other.parts
+    )
+    with pytest.raises(InputError, match=r"velocity gives velocity\.x, which is a feature"):
+        Coordinates(TASK.replace(features=named), spoiled)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "kinds"),
+    [
+        (["position_x"], {"scalar"}),
+        (["position_x", "position_y"], {"scalar"}),
+        (["position_z"], {"point"}),
+    ],
+)
+def test_what_is_left_of_a_vector_is_one_only_where_it_is_x_and_y(hidden, kinds):
+    seen = with_view(TASK, [*hidden, "orientation_w"])
+    assert {each.kind for each in seen.features if each.group == "position"} == kinds
+    assert {each.kind for each in seen.features if each.group == "orientation"} == {"scalar"}
+
+
+def test_an_angle_is_given_back_in_its_range():
+    turning = Feature("knee", "rad", 0.0, 4.7, kind="angle")
+    task = TASK.whole.replace(features=(turning, *TASK.features))
+    coordinates = make_coordinates(task, "angles")
+    rows = np.insert(states(TASK, 3), 0, (3.0, 3.2, 4.5), axis=1)
+    np.testing.assert_allclose(coordinates.inverse(coordinates.forward(rows))[:, 0], rows[:, 0])
+
+
+def test_a_free_thing_beside_a_heavier_arm_is_no_robot(monkeypatch):
+    arm = '<body><joint axis="0 1 0"/><geom size=".2" density="9000"/><site name="s"/></body>'
+    task = made(monkeypatch, bodies=PUCK + arm)
+    assert "point" not in kinds(task)
+    with pytest.raises(InputError, match="no feature that says where its robot is"):
+        make_coordinates(task, "symmetry")
+
+
 def test_a_strangers_coordinates_are_checked():
     parts = make_coordinates(TASK, "symmetry").parts
     plain = to_plain(parts)
     assert from_plain(plain, tuple[Part, ...]) == parts
     for spoiled, said in (
-        ([*plain, plain[0]], "two parts of the coordinates give the same name"),
+        ([*plain, plain[0]], "two parts of the coordinates give '"),
         ([[*plain[0][:1], "exec", *plain[0][2:]]], "'exec': it must be one of attitude, body"),
         ([["a", "circle", ["x", "y"], True, 0.0]], "a, circle, takes 1 numbers, but is given 2"),
         ([["a", "polar", ["x", "y"], True, 0.0]], "the soft length of a is 0"),

@@ -531,7 +531,7 @@ def test_gains_over_another_policy_than_the_best_are_told_as_such(whole, tmp_pat
     record.replace(study=blind).write(tmp_path / RECORD)
     tables = read_tables(tmp_path)
     (table,) = returns_tables(tables)
-    assert table.title.endswith("; gains are over random, as it was registered")
+    assert table.title.endswith("; gains are over random")
     assert "over constant drive" in table.header
     assert reference_words(tables.analysis.groups[0]) == "what random returns, 320"
 

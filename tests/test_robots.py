@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from arms import STEPS, Arm
 from command import jbrep, mistake, refused
+from gymnasium.envs.registration import EnvSpec
 from small import contents
 
 from jbrep.collect import collect
@@ -219,6 +220,30 @@ def test_a_clock_that_32_bits_swallow_is_told_and_shifted(tmp_path):
     env.close()
     assert seen[order.index("clock")] == 0.25
     assert jbrep("data", "verify", tmp_path / "e", "--replay", 1).exit_code == 0
+
+
+def test_a_range_is_of_what_an_offset_leaves(tmp_path):
+    path = tmp_path / "f.toml"
+    path.write_text(
+        "[[features]]\noffset = 0.5\n[[features]]\noffset = 5\nhigh = 2\n[[features]]\n"
+    )
+    given, task = describe("Pendulum-v1"), describe("Pendulum-v1", features=path)
+    assert [(each.low, each.high) for each in given.features] == [(-1, 1), (-1, 1), (-8, 8)]
+    assert [(each.low, each.high) for each in task.features] == [(-1.5, 0.5), (-6, 2), (-8, 8)]
+
+
+@pytest.mark.parametrize("made", [{"id": "Mine-v0"}, None])
+def test_a_class_describes_itself(made, monkeypatch):
+    """As a task, and no other one."""
+
+    class Mine(gymnasium.Env):
+        @staticmethod
+        def describe(arguments, max_episode_steps):
+            return made or describe("Pendulum-v1")
+
+    monkeypatch.setitem(gymnasium.registry, "Mine-v0", EnvSpec("Mine-v0", Mine))
+    with pytest.raises(InputError, match="describe must return a jbrep"):
+        describe("Mine-v0")
 
 
 def test_features_of_a_batch_have_no_offsets():

@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from functools import cached_property
@@ -17,6 +18,7 @@ from jbrep.errors import InputError
 from jbrep.records.record import Record
 
 _MAX_NUMBERS = 4096
+_MOST_TURN = 2.02 * math.pi  # rounding of a full turn is in it
 _PLAIN = SimpleNamespace(sin=math.sin, cos=math.cos, sqrt=math.sqrt, arctan2=math.atan2)
 _Soft = Annotated[float, Meta(ge=0, le=1e12)]
 
@@ -103,9 +105,11 @@ class Coordinates:
             raise InputError("none of the coordinates is shown")
         if len(given) > _MAX_NUMBERS:
             raise InputError(f"there are {len(given):,} coordinates: the limit is {_MAX_NUMBERS:,}")
-        if len(set(given)) < len(given):
-            raise InputError("two parts of the coordinates give the same name")
+        if twice := [name for name, count in Counter(given).items() if count > 1]:
+            raise InputError(f"two parts of the coordinates give {twice[0]!r}")
         for part in self.parts:
+            if part.formula != "same" and (own := {*part.gives} & {*self.task.feature_names}):
+                raise InputError(f"{part.name} gives {min(own)}, which is a feature")
             if missing := [name for name in part.of if name not in known]:
                 raise InputError(
                     f"{part.name} takes {missing[0]}, which {self.task.name} doesn't have"
@@ -258,8 +262,9 @@ def in_range(values: Any, feature: Feature) -> Any:
     if not feature.is_angle:
         return values
     middle = 0.0
-    if feature.is_full_turn and feature.low is not None and feature.high is not None:
-        middle = (feature.high + feature.low) / 2
+    if feature.low is not None and feature.high is not None:
+        is_wider = feature.high - feature.low > _MOST_TURN  # than any angle can tell
+        middle = 0.0 if is_wider else (feature.high + feature.low) / 2
     return wrapped(values - middle) + middle
 
 

@@ -73,9 +73,10 @@ def check_invariant(coordinates: Coordinates) -> None:
 
 
 def _not_the_same(task: Task, what: str, as_it_is: float, turned: float) -> InputError:
+    past = "; what is seen of the past isn't turned" if task.view and task.view.history > 1 else ""
     return InputError(
         f"{task.name} isn't the same for a turned robot: {what} is {as_it_is:.4g} without a "
-        f"quarter turn and {turned:.4g} after one; use coordinates in place of symmetry"
+        f"quarter turn and {turned:.4g} after one{past}; use coordinates in place of symmetry"
     )
 
 
@@ -105,8 +106,9 @@ def _played(
     for step in range(turned + _AFTER):
         if step == _BEFORE and not quarter_turn(envs[1], shift):
             raise InputError(
-                f"symmetry can't be tried on {task.name}: its robot isn't the only free body of "
-                "MuJoCo's, and its environment has no quarter_turn; use coordinates"
+                f"symmetry can't be tried on {task.name}: it isn't the only free body in MuJoCo, "
+                "and its environment has no method quarter_turn(shift); give it one, or use "
+                "coordinates"
             )
         action = random.uniform(task.action_low, task.action_high).astype(np.float32)
         moved = [env.step(action_in(env.action_space, action)) for env in envs]

@@ -103,6 +103,8 @@ class _Maker:
         self, name: str, formula: Any, of: _Names, shown: bool = True, soft: float = 0
     ) -> _Names:
         part = Part(name=name, formula=formula, of=of, shown=shown, soft=soft)
+        while formula != "same" and {*part.gives} & {*self._task.feature_names}:
+            part = part.replace(name=f"{part.name}.{formula}")
         self._parts.append(part)
         return part.gives
 

@@ -124,7 +124,9 @@ def _describe(
         converted(max_episode_steps, EpisodeSteps, "the number of steps in an episode")
     with refusing(f"{spec.id} failed when it was tried", told=reason), aside():
         if own := getattr(creator(spec), "describe", None):
-            described: Task = own({**spec.kwargs, **given}, max_episode_steps)
+            described = own({**spec.kwargs, **given}, max_episode_steps)
+            if not (isinstance(described, Task) and described.id == spec.id):
+                raise TypeError(f"describe must return a jbrep.envs.Task with the id {spec.id}")
             return described, None
         return _probe(spec.id, given, max_episode_steps)
 
@@ -391,7 +393,9 @@ def with_features(task: Task, path: Path) -> Task:
         for i, row in enumerate(rows or ()):
             said = _said(row)
             offset = said.pop("offset", 0.0)
-            features[i] = features[i].replace(**said)
+            ends = {name: getattr(features[i], name) for name in ("low", "high")}
+            left = {name: end - offset for name, end in ends.items() if end is not None}
+            features[i] = features[i].replace(**left | said)
             if offset:
                 offsets[features[i].name] = offset
         told = {**_said(changes), "features": features}

@@ -78,18 +78,18 @@ def with_kinds(env: gymnasium.Env[Any, Any], features: Sequence[Feature]) -> tup
 
 def _quantities(model: mujoco.MjModel) -> Iterator[tuple[int, _Quantity]]:
     """Numbers of the state, qpos and then qvel, that aren't scalars, by their places."""
-    free = _free_joints(model)
+    robot = _robot_joint(model)
     for joint in range(model.njnt):
         name, place = f"joint{joint}", int(model.jnt_qposadr[joint])
         speed = model.nq + int(model.jnt_dofadr[joint])
-        if joint in free[:1]:
+        if joint == robot:
             yield from _row(place, "point", "world", "m", f"{name}.position", 3)
             yield from _row(place + 3, "quaternion", "", "1", f"{name}.attitude", 4)
             yield from _row(speed, "vector", "world", "m/s", f"{name}.velocity", 3)
             yield from _row(speed + 3, "vector", "body", "rad/s", f"{name}.angular_velocity", 3)
         elif _is_angle(model, joint):
             yield place, _Quantity("angle", "", "rad", "", 0)
-    if not free and (root := _planar_root(model)):
+    if robot is None and (root := _planar_root(model)):
         x, y, turn = root
         for axis, joint in enumerate((x, y)):
             yield (
@@ -104,9 +104,15 @@ def _quantities(model: mujoco.MjModel) -> Iterator[tuple[int, _Quantity]]:
 
 
 def _free_joints(model: mujoco.MjModel) -> list[int]:
-    """The joints of free bodies, first the robot's, which is the heaviest tree."""
-    free, root = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE), root_of(model)
-    return sorted(free.tolist(), key=lambda joint: bool(model.jnt_bodyid[joint] != root))
+    """The joints of free bodies."""
+    free: list[int] = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).tolist()
+    return free
+
+
+def _robot_joint(model: mujoco.MjModel) -> int | None:
+    """The joint by which the robot is free, if it is: it is the heaviest tree."""
+    root = root_of(model)
+    return next((each for each in _free_joints(model) if model.jnt_bodyid[each] == root), None)
 
 
 def _is_angle(model: mujoco.MjModel, joint: int) -> bool:
@@ -217,11 +223,11 @@ def quarter_turn(env: gymnasium.Env[Any, Any], shift: tuple[float, float]) -> bo
     if physics is None:
         return False
     model, data = physics
-    free = _free_joints(model)
-    if len(free) > 1:
+    robot = _robot_joint(model)
+    if any(each != robot for each in _free_joints(model)):
         return False  # whether the others belong to the robot isn't known
-    if free:
-        place, speed = int(model.jnt_qposadr[free[0]]), int(model.jnt_dofadr[free[0]])
+    if robot is not None:
+        place, speed = int(model.jnt_qposadr[robot]), int(model.jnt_dofadr[robot])
         quaternion = data.qpos[place + 3 : place + 7]
         quaternion[:] = turned_quaternion(quaternion)
         places, speeds = [place, place + 1], [speed, speed + 1]

@@ -239,6 +239,8 @@ class Separate:
     @property
     def _missing_said(self) -> str:
         missing = self._task.missing
+        if missing == "skip":
+            return "no episode can end before its first step: give --missing hold:1, or more"
         return f"that is beyond --missing {missing}" if missing else "--missing says what to do"
 
     def _lose(self, lane: int) -> None:

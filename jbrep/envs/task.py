@@ -2,8 +2,10 @@
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import groupby
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -170,9 +172,28 @@ class View(Record, frozen=True):
         """Where the features that are seen stand among all."""
         return [i for i, each in enumerate(self.features) if each.name not in self.hidden]
 
+    @property
+    def _broken(self) -> set[str]:
+        """Groups of a vector or quaternion of which no vector of x and y, or all, is left."""
+        names: dict[str, list[str]] = {}
+        kinds = {each.group: each.kind for each in self.features if each.kind in SPATIAL}
+        for each in self.features:
+            names.setdefault(each.group, []).append(each.name)
+        left = {group: [n for n in names[group] if n not in self.hidden] for group in kinds}
+        return {
+            group
+            for group, kind in kinds.items()
+            if len(left[group]) not in SPATIAL[kind]
+            or left[group] != names[group][: len(left[group])]
+        }
+
     def seen(self, low: Sequence[float], high: Sequence[float]) -> tuple[Feature, ...]:
         """Features of the observation, given the bounds of actions, (k,) each."""
-        now = [self.features[i] for i in self.places]
+        broken = self._broken
+        now = [
+            each.replace(kind="scalar", frame="") if each.group in broken else each
+            for each in (self.features[i] for i in self.places)
+        ]
         action = "action" if len(low) == 1 else "action_{}"
         taken = [
             Feature(name=action.format(i), low=a, high=b, bounded=True, group="action")
@@ -249,8 +270,7 @@ class Task(Record, frozen=True):
             raise InputError("its arguments must be plain JSON, all numbers finite") from None
         if len(set(self.feature_names)) < self.size:
             raise InputError("its features must have different names")
-        if sum(place.stop - place.start for place in self.groups.values()) != self.size:
-            raise InputError("features of a group must stand side by side")
+        _check_side_by_side(self.features)
         for name, place in self.groups.items():
             _check_group(name, self.features[place])
         if self.state.keys() & self.constants.keys():
@@ -390,6 +410,17 @@ def _check_spread(domain: Domain | UnsetType, size: int) -> None:
 def _check_range(name: str, low: float | None, high: float | None) -> None:
     if low is not None and high is not None and low > high:
         raise InputError(f"the range of {name} is from {low:g} to {high:g}: swap them")
+
+
+def _check_side_by_side(features: Sequence[Feature]) -> None:
+    blocks = Counter(
+        name for name, _ in groupby(features, key=lambda each: each.group or each.name)
+    )
+    if several := [name for name, count in blocks.items() if count > 1]:
+        raise InputError(
+            f"features of the group {several[0]!r} must stand side by side: give those that don't "
+            "belong to it a group of their own"
+        )
 
 
 def _check_group(name: str, features: tuple[Feature, ...]) -> None:

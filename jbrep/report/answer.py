@@ -121,7 +121,10 @@ def _conclusion(analysis: Analysis) -> Iterable[str]:
         if analysis.planned.rules.gains_over != "drives":
             yield f"As it was registered, gains count over {over(analysis.planned.rules)}."
     elif analysis.planned.rules.primary:
-        yield "Nothing is decided yet: nothing that was registered has two runs a side."
+        yield (
+            "Nothing is decided yet: there are no statistics of what was registered, which take "
+            "two runs a side."
+        )
     elif len(silent) < len(compared):
         runs = [len(label.seeds) for group in compared for label in group.labels]
         each = counted(runs[0], "run") if len({*runs}) == 1 else f"{min(runs)} to {max(runs)} runs"

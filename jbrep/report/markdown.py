@@ -43,7 +43,7 @@ def _parts(
 def _findings(analysis: Analysis, answers: Sequence[Answer]) -> Iterator[str]:
     """Verdicts as tables, then in sentences."""
     for group in analysis.groups:
-        if group.compares:
+        if group.compared:
             title = f"{group.name}, compared with {analysis.baseline}"
             yield _titled(matrix(group, analysis.planned)._replace(title=title))
             yield escape(f"Gains are counted over {reference_words(group)}.")

@@ -49,7 +49,7 @@ def page(tables: Tables, plots: Sequence[Plot], predictions: Sequence[Table]) ->
 
 def _beside(analysis: Analysis | None) -> str:
     """What comparisons with the baseline are called; empty where nothing can be compared."""
-    compared = [group for group in (analysis.groups if analysis else ()) if group.compares]
+    compared = [group for group in (analysis.groups if analysis else ()) if group.compared]
     if not analysis or not compared:
         return ""
     return "Verdicts" if any(each.is_judged for each in compared) else f"Beside {analysis.baseline}"

@@ -13,6 +13,7 @@ from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.arms import FEWEST_UNITS
 from jbrep.stats.comparison import Comparison
 from jbrep.stats.labels import REACHED, RepresentationResult
+from jbrep.stats.scale import LOOKING
 from jbrep.text import Table, possessive
 
 _MOST_DIGITS = 9  # after the point
@@ -51,9 +52,7 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
     """A row for each agent, then for each policy that doesn't learn; no column without content."""
     first = groups[0]
     kept = {
-        comparison.representation: comparison
-        for comparison in first.comparisons
-        if comparison.is_open and first.compares
+        comparison.representation: comparison for comparison in first.compared if comparison.is_open
     }
     form, best = return_form(groups), first.best_policy
     counted_over_another = first.reference_policy != best
@@ -94,7 +93,7 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
 def _gained(group: GroupAnalysis, kept: Sequence[Comparison]) -> str:
     """What the column of gains is: over what they are, of which runs its shares."""
     told = f"gains are over {group.reference_policy or reference_words(group)}"
-    if group.reference_policy != group.best_policy and group.reference_policy:
+    if group.is_judged and group.reference_policy not in (None, group.best_policy):
         told += ", as it was registered"
     if not all(comparison.counts_all for comparison in kept):
         told += "; shares are of the runs that verdicts count"
@@ -142,9 +141,17 @@ def steps(label: RepresentationResult, name: str) -> str:
 def return_form(groups: Sequence[GroupAnalysis], more: int = 0) -> str:
     """A format for returns: three digits of the range of final returns, or more of them.
 
-    Of a range that is small beside the returns themselves, as many as give these five.
+    Those of policies that don't look are among them. Of a range that is small beside the returns
+    themselves, as many as give these five.
     """
-    returns = [each for group in groups for each in group.profile_returns[[0, -1]]]
+    final = [label.by_run["final_return"] for group in groups for label in group.labels]
+    blind = [
+        mean.value
+        for group in groups
+        for policy, mean in group.references.items()
+        if policy != LOOKING
+    ]
+    returns = np.concatenate((*final, blind))
     width = max(max(returns) - min(returns), max(map(abs, returns)) / 100)
     return f",.{np.clip(2 - math.floor(math.log10(width)), 0, _MOST_DIGITS) + more}f"
 

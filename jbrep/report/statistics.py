@@ -115,9 +115,9 @@ def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[Table]:
     tables = [label_table(group), _spread_table(group)]
     if any(label.encoders > 1 for label in group.labels):
         tables.append(_component_table(group))
-    if any(comparison.is_open for comparison in group.comparisons):
+    if any(comparison.is_open for comparison in group.compared):
         tables.append(_comparison_table(group, analysis.baseline))
-    if group.compares:
+    if group.compared:
         table = (
             _verdict_table(group) if group.is_judged else _estimate_table(group, analysis.planned)
         )
@@ -198,7 +198,7 @@ def _comparison_table(group: GroupAnalysis, baseline: str) -> Table:
     form = return_form([group])
     return Table.of(
         f"Compared with {baseline}",
-        [comparison for comparison in group.comparisons if comparison.is_open],
+        [comparison for comparison in group.compared if comparison.is_open],
         {
             _KEY: _NAME,
             "final return": _number("final_return_difference", form),
@@ -229,7 +229,7 @@ def _verdict_table(group: GroupAnalysis) -> Table:
                 probability(verdict.level),
                 " and ".join(map(str, verdict.runs)),
             )
-            for comparison in group.comparisons
+            for comparison in group.compared
             for verdict in comparison.verdicts
         ],
     )
@@ -248,7 +248,7 @@ def _estimate_table(group: GroupAnalysis, planned: Planned) -> Table:
                 comparison.representation,
                 *(told(claims[i].name, comparison.verdicts[i].estimate) for i in columns),
             )
-            for comparison in group.comparisons
+            for comparison in group.compared
         ],
     )
 
@@ -265,7 +265,7 @@ def matrix(group: GroupAnalysis, planned: Planned) -> Table:
                 comparison.representation,
                 *("; ".join(filter(None, (v.verdict, remark(v)))) for v in comparison.verdicts),
             )
-            for comparison in group.comparisons
+            for comparison in group.compared
         ],
     )
 

@@ -59,9 +59,10 @@ class GroupAnalysis:
         return any(comparison.is_judged for comparison in self.comparisons)
 
     @property
-    def compares(self) -> bool:
-        """Whether something can be compared: the baseline learned, or what was found is decided."""
-        return self.is_judged or (bool(self.comparisons) and self.labels[0].learnt == YES)
+    def compared(self) -> list[Comparison]:
+        """What can be compared: all if the baseline learned, or else what is judged."""
+        learned = self.labels[0].learnt == YES
+        return [each for each in self.comparisons if learned or each.is_judged]
 
     @property
     def name(self) -> str:
@@ -146,7 +147,9 @@ def _analyse_group(
     seed: int,
 ) -> GroupAnalysis:
     first, known = evaluated_run(group), compared(group)
-    starts = None if known.on_all_starts or not len(first.steps) else first.returns.shape[1]
+    starts = None
+    if len(first.steps):
+        starts = len(first.evaluations[-1]) if known.on_all_starts else first.returns.shape[1]
     played = {
         policy: mean_within(np.array(returns[:starts]), first.bounds, LEVEL)
         for policy, returns in references.items()

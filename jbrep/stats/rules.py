@@ -274,8 +274,9 @@ def _tested(
     reason = _reason(claim, sides, planned.rules, direction, level)
     if reason is None and np.isnan(p):
         reason = "nothing varies from run to run"
-    if reason is None and not direction and look < len(planned.counts):
-        reason = f"another look comes at {planned.counts[look]} runs"
+    if (reason or not direction) and look < len(planned.counts):
+        later = f"another look comes at {planned.counts[look]} runs"
+        reason = f"{reason}; {later}" if reason else later
     return replace(
         estimated,
         verdict={1: SUPPORTED, -1: CONTRADICTED, 0: UNDECIDED}[0 if reason else int(direction)],

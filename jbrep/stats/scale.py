@@ -17,6 +17,7 @@ STILL, CONSTANT, RANDOM = "standing still", "constant drive", "random"  # polici
 LOOKING = "hand-written"  # nor does this one learn
 STEPS_TO = (*(f"steps_to_{name}" for name in SHARES), SOLVED)
 _POINTS = 50  # of a performance profile, about, or half as many: round numbers
+_FAR = 100  # times the range of returns, beyond which a floor is no place to begin
 
 
 class Scale(NamedTuple):
@@ -91,8 +92,14 @@ def _blind(compared: Compared, run: RunCurve, policies: Mapping[str, Interval]) 
 
 
 def _round_numbers(returns: Array, floor: float | None) -> Array:
-    """Round numbers, evenly spaced, from the floor or else below all returns to the largest."""
-    low, high = float(returns.min() if floor is None else floor), float(returns.max())
+    """Round numbers, evenly spaced, to the largest return: from the floor, or from below them all.
+
+    The latter where no floor is known, or it is far below them.
+    """
+    low, high = float(returns.min()), float(returns.max())
+    if floor is not None and low - floor > _FAR * (high - low):
+        floor = None
+    low = low if floor is None else floor
     width = high - low
     if width <= 1e-6 * abs(high):  # all runs return the same
         width = abs(high) or 1.0

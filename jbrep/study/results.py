@@ -287,7 +287,7 @@ def _curve(
         failed_at=run.steps if run.status == FAILED else None,
         return_floor=task.return_floor,
         return_ceiling=task.return_ceiling,
-        reference=_mean(counted_over),
+        reference=_mean(counted_over[: shared.final_episodes]),
         reference_in_training=_mean(counted_over[:episodes]),
         solved=task.solved_return,
         trainer=" ".join(trainer),

@@ -48,7 +48,7 @@ def claim_plot(analysis: Analysis, looks: Looks) -> Plot:
 
 def _rows(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     for group in analysis.groups:
-        for comparison in group.comparisons if group.compares else ():
+        for comparison in group.compared:
             for each in comparison.verdicts:
                 numbers = (*each.estimate, *each.interval[1:], each.boundary)
                 key = (group.task, group.algorithm, comparison.representation, each.claim)
@@ -57,10 +57,10 @@ def _rows(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 
 def _draw(analysis: Analysis, looks: Looks) -> Figure:
     """A row of panels for each group, a column for each estimand, to one scale each."""
-    groups = [group for group in analysis.groups if group.compares]
+    groups = [group for group in analysis.groups if group.compared]
     look, claims = looks(), statements(analysis.planned)
     columns = _columns(claims)
-    most = max(len(group.comparisons) for group in groups)
+    most = max(len(group.compared) for group in groups)
     width = COLUMN if len(columns) == 1 else PAGE
     figure = Figure(figsize=(width, 0.2 + (0.75 + 0.19 * most) * len(groups)))
     panels = figure.subplots(len(groups), len(columns), squeeze=False, sharey="row")
@@ -88,7 +88,7 @@ def _columns(claims: Sequence[Statement]) -> list[list[int]]:
 
 
 def _verdicts(groups: Groups, numbers: Sequence[int]) -> list[Verdict]:
-    every = (each.verdicts for group in groups for each in group.comparisons)
+    every = (each.verdicts for group in groups for each in group.compared)
     return [verdicts[number] for verdicts in every for number in numbers]
 
 
@@ -112,7 +112,7 @@ def _draw_panel(axes: Axes, group: GroupAnalysis, numbers: Sequence[int], look: 
     left, right = axes.get_xlim()
     for verdict in _verdicts([group], numbers)[: len(numbers)]:
         axes.axvline(verdict.boundary, **reference())
-    for row, comparison in enumerate(group.comparisons):
+    for row, comparison in enumerate(group.compared):
         verdict, style = comparison.verdicts[numbers[0]], look[comparison.representation]
         for (_, *ends), width in ((verdict.interval, 0.8), (verdict.estimate, 2)):
             drawn = np.nan_to_num(ends, nan=np.nan, neginf=left, posinf=right)

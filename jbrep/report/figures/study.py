@@ -40,7 +40,7 @@ def study_plots(
     plots, played = [], _on_all_starts(references, returns)
     if analysis:
         plots += [final_return(groups, looks), curves(groups, played, looks)]
-        if any(group.compares for group in groups):
+        if any(group.compared for group in groups):
             plots.append(claim_plot(analysis, looks))
         plots.append(learning_rate(groups, played, looks))
         if any(len(label.seeds) >= FEWEST_RUNS for group in groups for label in group.labels):
