@@ -148,6 +148,7 @@ def test_settings_reach_the_agent():
         ("tqc", {"n_quantiles": 2}, "top_quantiles_to_drop_per_net is 2: .* below n_quantiles, 2"),
         ("sac", {"gradient_steps": 0}, "gradient_steps is 0, with which nothing is learned"),
         ("sac", {"target_update_interval": 9}, "is 9: it counts .* at most gradient_steps, 1"),
+        ("sac", {"net_arch": [1024] * 4, "n_critics": 8}, "the networks take .*,.*,.* bytes: 134,"),
     ],
 )
 def test_what_a_setting_can_not_be(algorithm, settings, message, tmp_path):

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from jbrep.errors import InputError, refusing
 from jbrep.records.record import converted, shown, to_plain
 from jbrep.rl.agent import ACTIVATIONS, Spaces, global_random_state_kept, make_agent, one_line
+from jbrep.rl.policy_file import MAX_BYTES
 from jbrep.rl.presets import (
     Hyperparameters,
     NetArch,
@@ -28,6 +29,7 @@ from jbrep.rl.presets import (
 )
 
 _MOST = 10**9  # of any number
+_MOST_BYTES = MAX_BYTES // 2  # of networks; the rest is for observations and an encoder
 _ANY_SPACES = (spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-1, 1, (1,), np.float32))
 _RANGES: dict[str, tuple[float, float]] = {  # others: from 1 if whole, else from 0
     **dict.fromkeys(("gamma", "tau", "gae_lambda", "batch_norm_momentum"), (0, 1)),
@@ -266,4 +268,10 @@ def _build(algorithm: str, chosen: Hyperparameters) -> None:
     with refusing(what, told=one_line), warnings.catch_warnings(), global_random_state_kept():
         warnings.simplefilter("ignore")  # training gives them
         env = DummyVecEnv([lambda: Spaces(*_ANY_SPACES)] * chosen.num_envs)
-        make_agent(algorithm, small, env, 0)
+        agent = make_agent(algorithm, small, env, 0)
+        size = sum(each.nbytes for each in agent.policy.state_dict().values())
+        if size > _MOST_BYTES:
+            raise InputError(
+                f"the networks take {size:,} bytes: {_MOST_BYTES:,} are possible, so take fewer or "
+                "smaller layers, or fewer critics"
+            )
