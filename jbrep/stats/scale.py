@@ -17,7 +17,7 @@ STILL, CONSTANT, RANDOM = "standing still", "constant drive", "random"  # polici
 LOOKING = "hand-written"  # nor does this one learn
 STEPS_TO = (*(f"steps_to_{name}" for name in SHARES), SOLVED)
 _POINTS = 50  # of a performance profile, about, or half as many: round numbers
-_FAR = 100  # times the range of returns, beyond which a floor is no place to begin
+_FAR = 1_000  # times the range of returns, beyond which a floor is no place to begin
 
 
 class Scale(NamedTuple):
