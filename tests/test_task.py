@@ -322,7 +322,7 @@ def test_a_forged_feature_is_refused(place, value):
 
 def test_features_of_a_group_stand_together():
     features = (Feature("x", group="a"), Feature("y", group="b"), Feature("z", group="a"))
-    with pytest.raises(ValueError, match="features of a group must stand side by side"):
+    with pytest.raises(ValueError, match="features of the group 'a' must stand side by side"):
         PLAIN.replace(features=features)
 
 
