@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from jbrep.errors import InputError
+from jbrep.report.returns import return_form
 from jbrep.report.statistics import statistics_text
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.aggregates import aggregates
@@ -624,3 +625,17 @@ def test_few_pairs_and_constant_values_say_nothing():
     assert np.isnan(rank_correlation(x[:4], x[:4], [*"abcd"])).all()
     assert np.isnan(rank_correlation(x, np.ones(5), [*"abcde"])).all()
     assert rank_correlation(x, x, [*"abcde"]).value == 1
+
+
+@pytest.mark.parametrize(
+    ("level", "changes", "form"),
+    [
+        (500, {}, ",.0f"),
+        (0, {"returns": np.zeros((11, 3))}, ",.2f"),  # all return the same
+        (0, {"returns": np.full((11, 3), np.nan)[:0], "steps": GRID[:0], "failed_at": 5}, ",.2f"),
+        (5, {"return_floor": -1e5}, ",.0f"),  # far below what agents return
+    ],
+)
+def test_returns_have_three_digits_of_their_range(level, changes, form):
+    runs = [make(name, i, level + 60 * i, **changes) for name in ("full", "dae") for i in range(3)]
+    assert return_form(analyse(runs).groups) == form

@@ -152,8 +152,9 @@ def return_form(groups: Sequence[GroupAnalysis], more: int = 0) -> str:
         if policy != LOOKING
     ]
     returns = np.concatenate((*final, blind))
-    width = max(max(returns) - min(returns), max(map(abs, returns)) / 100)
-    return f",.{np.clip(2 - math.floor(math.log10(width)), 0, _MOST_DIGITS) + more}f"
+    known = returns[np.isfinite(returns)]
+    width = max(np.ptp(known), np.abs(known).max() / 100) if len(known) else 0.0
+    return f",.{np.clip(2 - math.floor(math.log10(width or 1.0)), 0, _MOST_DIGITS) + more}f"
 
 
 def shown_return(value: float, groups: Sequence[GroupAnalysis]) -> str:

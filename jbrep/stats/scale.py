@@ -97,7 +97,7 @@ def _round_numbers(returns: Array, floor: float | None) -> Array:
     The latter where no floor is known, or it is far below them.
     """
     low, high = float(returns.min()), float(returns.max())
-    if floor is not None and low - floor > _FAR * (high - low):
+    if floor is not None and low - floor > _FAR * (high - low) > 0:
         floor = None
     low = low if floor is None else floor
     width = high - low
