@@ -38,6 +38,7 @@ from jbrep.report.returns import returns_tables
 from jbrep.report.tables import read_tables
 from jbrep.report.words import answers, reference_words
 from jbrep.rl.files import ENCODER, EVALUATIONS, Evaluation, read_run
+from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.claims import CLAIMS, FASTER
 from jbrep.stats.rules import Rules
 from jbrep.study.config import Study, as_study
@@ -519,7 +520,7 @@ def test_a_report_compares_with_the_study_s_baseline(whole, tmp_path):
     assert claims[0] == "Agents lose at most 10 % of the gain on pca-8"
 
 
-def test_gains_over_another_policy_than_the_best_are_told_as_such(whole, tmp_path):
+def test_gains_over_another_policy_than_the_best_are_told_as_such(whole, tmp_path, monkeypatch):
     """The better of standing still and random actions, where a constant drive returns more."""
     copy_tables(whole, tmp_path)
     path = tmp_path / REFERENCE_RETURNS
@@ -532,6 +533,10 @@ def test_gains_over_another_policy_than_the_best_are_told_as_such(whole, tmp_pat
     tables = read_tables(tmp_path)
     (table,) = returns_tables(tables)
     assert table.title.endswith("; gains are over random")
+    with monkeypatch.context() as judged:
+        judged.setattr(GroupAnalysis, "is_judged", True)
+        (table,) = returns_tables(tables)
+    assert table.title.endswith("; gains are over random, as it was registered")
     assert "over constant drive" in table.header
     assert reference_words(tables.analysis.groups[0]) == "what random returns, 320"
 

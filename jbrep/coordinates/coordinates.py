@@ -18,7 +18,7 @@ from jbrep.errors import InputError
 from jbrep.records.record import Record
 
 _MAX_NUMBERS = 4096
-_MOST_TURN = 2.02 * math.pi  # rounding of a full turn is in it
+_FULL_TURN = 2.02 * math.pi  # and what rounding adds
 _PLAIN = SimpleNamespace(sin=math.sin, cos=math.cos, sqrt=math.sqrt, arctan2=math.atan2)
 _Soft = Annotated[float, Meta(ge=0, le=1e12)]
 
@@ -261,10 +261,10 @@ def in_range(values: Any, feature: Feature) -> Any:
     """An angle in its feature's range, or within half a turn of 0; other values as they are."""
     if not feature.is_angle:
         return values
-    middle = 0.0
-    if feature.low is not None and feature.high is not None:
-        is_wider = feature.high - feature.low > _MOST_TURN  # than any angle can tell
-        middle = 0.0 if is_wider else (feature.high + feature.low) / 2
+    low, high = feature.low, feature.high
+    if low is None or high is None or high - low > _FULL_TURN:
+        return wrapped(values)
+    middle = (low + high) / 2
     return wrapped(values - middle) + middle
 
 

@@ -174,18 +174,15 @@ class View(Record, frozen=True):
 
     @property
     def _broken(self) -> set[str]:
-        """Groups of a vector or quaternion of which no vector of x and y, or all, is left."""
-        names: dict[str, list[str]] = {}
-        kinds = {each.group: each.kind for each in self.features if each.kind in SPATIAL}
-        for each in self.features:
-            names.setdefault(each.group, []).append(each.name)
-        left = {group: [n for n in names[group] if n not in self.hidden] for group in kinds}
-        return {
-            group
-            for group, kind in kinds.items()
-            if len(left[group]) not in SPATIAL[kind]
-            or left[group] != names[group][: len(left[group])]
-        }
+        """Groups of a vector or quaternion of which neither all is left nor x and y."""
+        found = set()
+        for group, part in groupby(self.features, key=lambda each: each.group):
+            whole = [*part]
+            left = [each for each in whole if each.name not in self.hidden]
+            counts = SPATIAL.get(whole[0].kind)
+            if counts and (len(left) not in counts or left != whole[: len(left)]):
+                found.add(group)
+        return found
 
     def seen(self, low: Sequence[float], high: Sequence[float]) -> tuple[Feature, ...]:
         """Features of the observation, given the bounds of actions, (k,) each."""
@@ -413,6 +410,7 @@ def _check_range(name: str, low: float | None, high: float | None) -> None:
 
 
 def _check_side_by_side(features: Sequence[Feature]) -> None:
+    """Make sure that no group comes in two parts."""
     blocks = Counter(
         name for name, _ in groupby(features, key=lambda each: each.group or each.name)
     )

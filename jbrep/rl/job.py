@@ -311,8 +311,9 @@ class Job:
         failure = "" if failed is None else str(failed)
         if failure and exists(folder / RUN):
             return self._record(agent, failure, read_run(folder).tables, b"")
-        if isinstance(failed, EnvironmentFailedError) and keep_checkpoint:
-            self._check_lost(failed)
+        goes_on = keep_checkpoint and exists(folder / CHECKPOINT)
+        if goes_on and isinstance(failed, EnvironmentFailedError):
+            raise self._stopped_by(failed) from failed
         (folder / RUN).unlink(missing_ok=True)  # of fewer steps, before its files change
         parts = agent.policy, self.run.task, self.encoder, self.settings
         trained = Trained(*parts, None, statistics_of(agent), action_repeat(agent))
@@ -330,13 +331,12 @@ class Job:
         result.write(folder / RUN)  # last: the run has ended where it exists
         return result
 
-    def _check_lost(self, failed: EnvironmentFailedError) -> None:
-        """Raise what ends a run without ending what it has learned, if there is a checkpoint."""
-        if exists(self.folder / CHECKPOINT):
-            goes_on = "the same command goes on from its last checkpoint"
-            played = "its last checkpoint can be played (jbrep evaluate-policy) and exported"
-            then = goes_on if self.run.task.reproducible else played
-            raise InputError(f"{failed}; of the run in {self.folder}, {then}") from failed
+    def _stopped_by(self, failed: Exception) -> InputError:
+        """The error that says what can be done with the last checkpoint."""
+        goes_on = "the same command goes on from its last checkpoint"
+        played = "its last checkpoint can be played (jbrep evaluate-policy) and exported"
+        then = goes_on if self.run.task.reproducible else played
+        return InputError(f"{failed}; of the run in {self.folder}, {then}")
 
     def _record(
         self, agent: BaseAlgorithm, failure: str, tables: Mapping[str, str], policy: bytes

@@ -1,6 +1,6 @@
 """Bags of ROS as rosbags reads them, within limits: a stranger's bag can be made to take anything.
 
-What is compressed is unpacked in memory, or beside the disk's other files: kilobytes can become
+What is compressed is unpacked in memory or to a temporary file, where kilobytes can become
 gigabytes. A database can compute what is read from it, and a type can have any number of parts.
 """
 

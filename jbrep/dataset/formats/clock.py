@@ -63,9 +63,9 @@ class Clock:
                 begins |= flags(name, flag, ended)
             step = np.diff(rows["time"], prepend=last["time"])
             back, silent = step < 0, step > (self._layout.gap or np.inf)
-            usual = usual or _usual(step)
-            pauses = step >= _PAUSE * (usual or np.inf)
             if not (self._layout.gap or self._layout.rate):
+                usual = usual or _usual(step)
+                pauses = step >= _PAUSE * (usual or np.inf)
                 self._counts["pauses"] += int((pauses & ~begins).sum())
             self._counts["back"] += int((back & ~begins).sum())
             self._counts["gaps"] += int((silent & ~begins).sum())

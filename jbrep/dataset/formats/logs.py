@@ -196,9 +196,9 @@ class _Reader:
             return
         if len(wrong := np.flatnonzero(~np.isfinite(values))):
             told = f"{self._at(first + int(wrong[0]))}: {leaf.name!r} is empty, or no finite number"
-            if role in (*WIDE, "reward"):
-                raise InputError(f"{told}: correct it, leave the row out, or give --missing")
-            raise InputError(f"{told}: correct it, or leave the row out")
+            can_miss = role in (*WIDE, "reward")
+            how = "leave the row out, or give --missing" if can_miss else "or leave the row out"
+            raise InputError(f"{told}: correct it, {how}")
 
     def _check_whole(self, leaf: Leaf, column: pa.Array, first: int) -> None:
         """Refuse whole numbers that floats lose digits of, as those beside empty cells become."""
