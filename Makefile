@@ -125,8 +125,8 @@ body-1 body-2 body-3: ## results/body-1/, -2/ and -3/ anew: half an hour each
 # the columns of a study's line in studies/judged.txt
 column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
 .SECONDEXPANSION:
+# one with claims is refused until it is registered: jbrep study studies/NAME.toml --register, then commit what that writes
 $(STUDIES): $(READY) $$(call column,1)
-	test -e runs/$@/registration.json || $(BIN)/jbrep study studies/$@.toml --register --out runs/$@
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
 	cp $$(ls $(addprefix runs/$@/,returns.csv runs.json references.csv run-infos.csv registration.json) 2>/dev/null) results/$@/
@@ -149,11 +149,11 @@ programme: $(PROGRAMME) ## all studies of the answer, one after another: a night
 programme-time: $(READY) ## how long that takes here, without what has ended
 	for study in $(PROGRAMME); do $(BIN)/jbrep study studies/$$study.toml --dry-run --out runs/$$study || exit; done
 
-# whether scores tell which codes serve: scored as soon as they are registered, before agents train on them
+# whether scores tell which codes serve: scored as soon as they are made, before agents train on them
 worth: $(filter worth-%,$(STUDIES)) ## how well they do: seven hours; goes on where it was stopped
 	$(BIN)/python tools/worth.py $(addprefix results/,$^)
 $(SCORED): scored-%: $(READY)
-	test -e runs/$*/registration.json || $(BIN)/jbrep study studies/$*.toml --register --out runs/$*
+	$(BIN)/python tools/prepare.py studies/$*.toml runs/$*
 	$(BIN)/jbrep evaluate --encoder $$(ls runs/$*/encoders/*/*.safetensors) --data runs/$*/data/* --out results/$*/scores
 
 trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; goes on where it was stopped

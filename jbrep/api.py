@@ -387,7 +387,8 @@ def study(
     from jbrep.study.runner import BACKENDS
     from jbrep.text import counted
 
-    plan, run = Plan(_study(study), Path(out)), choose(backend, BACKENDS, "backend")
+    file = Path(study) if isinstance(study, str | Path) else None
+    plan, run = Plan(_study(study), Path(out), file), choose(backend, BACKENDS, "backend")
     for notice in plan.study.notices:
         _note(notice)
     if crashed := run_study(plan, run, workers, width):

@@ -26,15 +26,16 @@ from jbrep.evaluate.evaluation import (
 from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, observe
 from jbrep.records.document import read_document
 from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, write
-from jbrep.report.figures.claims import claim_plot
 from jbrep.report.figures.curves import every_run
 from jbrep.report.figures.diagnostics import _free
+from jbrep.report.figures.differences import difference_plot
 from jbrep.report.figures.methods import method_plots, timescales
 from jbrep.report.figures.plot import Drawing
 from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, family, styles, with_runs
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
+from jbrep.stats.rules import Verdict
 
 STEPS = np.arange(0, 50_001, 10_000)
 FINAL = {"full": 900, "dae-8": 500, "pca-4": 300}
@@ -62,6 +63,7 @@ def runs():
                     total_steps=50_000,
                     return_floor=0,
                     reference=0,
+                    top=950,
                     solved=900,
                     failed_at=30_000 if (label, seed) == ("pca-4", 3) else None,
                 )
@@ -89,7 +91,7 @@ def panels(figure):
 
 def test_a_study_has_every_figure(plots):
     assert list(plots) == [
-        *("final_return", "representations", "claims", "learning_rate", "profiles"),
+        *("final_return", "representations", "differences", "learning_rate", "profiles"),
         *("across_tasks", "every_run", "system", "autoencoders"),
     ]
 
@@ -107,7 +109,7 @@ def test_each_figure_is_written_as_pdf_and_png_beside_its_table(analysis, return
         header, *rows = csv.reader(path.with_suffix(".csv").read_text().splitlines())
         assert header == list(plot.columns)
         assert len(rows) == len(plot.rows) > 0
-    write([plots["claims"]], tmp_path / "again")
+    write([plots["differences"]], tmp_path / "again")
     for path in (tmp_path / "again").iterdir():
         assert path.read_bytes() == (tmp_path / "figures" / path.name).read_bytes()
 
@@ -226,7 +228,7 @@ def test_a_study_of_many_representations_can_be_read():
     many = [replace(run, representation=name) for name in names for run in other]
     plots = study_plots(analyse(full + many), [], {}, {})
     for plot in plots:
-        if plot.name in ("representations", "profiles", "learning_rate", "claims"):
+        if plot.name in ("representations", "profiles", "learning_rate", "differences"):
             figure = Drawing(plot.draw, PAPER)._figure
             heights = [axes.get_window_extent().height / figure.dpi for axes in figure.axes]
             assert min(heights) > 0.8, plot.name
@@ -290,43 +292,54 @@ def test_no_interval_stretches_an_axis_and_cuts_are_marked(analysis):
     assert cut_marks(axes, "^v") == [(0.16, axes.get_ylim()[1], "^")]
 
 
-def test_claims_stand_with_intervals_and_boundaries(plots, analysis):
-    kept, spread, time = drawn(plots["claims"]).axes[:3]
-    first, varies, *_ = analysis.groups[0].comparisons[0].verdicts
-    *boundaries, thin, thick, point = kept.lines[:5]
-    assert [line.get_xdata()[0] for line in boundaries] == [0.9, 0.95]
-    np.testing.assert_array_equal(thin.get_xdata(), first.interval[1:])
-    np.testing.assert_array_equal(thick.get_xdata(), first.estimate[1:])
-    assert point.get_xdata()[0] == first.estimate.value
-    assert kept.get_title(loc="left") == "face_direction, ddpg\nnot worse, within half the margin"
-    texts = [text.get_text() for text in kept.get_yticklabels()]
-    assert texts == ["dae-8 (n = 4)", "pca-4 (n = 4)"]
-    assert (spread.get_xscale(), time.get_xscale()) == ("log", "linear")
-    assert spread.lines[3].get_xdata()[0] == varies.estimate.value
+def difference_panel(group, analysis):
+    """The panel of the first group, which is given."""
+    changed = replace(analysis, groups=(group, *analysis.groups[1:]))
+    plot = difference_plot(changed, lambda: styles(FINAL))
+    return drawn(plot).axes[0], plot.rows
 
 
-def test_a_ratio_far_from_one_is_marked_at_the_edge(analysis):
-    (group, *_), far = analysis.groups, Interval(1e-9, 1e-12, 1e-6)
-    first, steady, *others = group.comparisons[0].verdicts
-    verdicts = (first, replace(steady, estimate=far, interval=far), *others)
-    comparisons = (replace(group.comparisons[0], verdicts=verdicts),)
-    changed = replace(group, labels=group.labels[:2], comparisons=comparisons)
-    axes = drawn(claim_plot(replace(analysis, groups=(changed,)), lambda: styles(FINAL))).axes[1]
-    low, high = axes.get_xlim()
-    assert 1e-5 < low < 1 < high < 1e5
-    assert (low, 0, "<") in cut_marks(axes, "<>")
+def test_differences_from_the_baseline_stand_with_their_intervals(analysis):
+    group = analysis.groups[0]
+    axes, rows = difference_panel(group, analysis)
+    tested, thick, point, boundary = axes.lines[:4]
+    value, *ends = group.comparisons[0].numbers["final_return_difference"]
+    assert np.isnan(tested.get_xdata()).all()
+    np.testing.assert_array_equal(thick.get_xdata(), ends)
+    assert point.get_xdata()[0] == value
+    assert {*boundary.get_xdata()} == {0}
+    assert axes.get_title(loc="left") == "face_direction, ddpg"
+    texts = [text.get_text() for text in axes.get_yticklabels()]
+    assert texts == ["dae-8 - full", "pca-4 - full"]
+    assert rows[0][2:6] == ("dae-8", "full", "", "")
 
 
-def test_an_interval_without_an_end_is_drawn_to_the_edge(analysis):
-    (group, *_), open_ended = analysis.groups, Interval(1.1, 0.8, np.inf)
-    first, *others = group.comparisons[0].verdicts
-    verdicts = (replace(first, estimate=open_ended, interval=open_ended), *others)
-    comparisons = (replace(group.comparisons[0], verdicts=verdicts),)
-    changed = replace(group, labels=group.labels[:2], comparisons=comparisons)
-    axes = drawn(claim_plot(replace(analysis, groups=(changed,)), lambda: styles(FINAL))).axes[0]
-    right = axes.get_xlim()[1]
-    assert [*axes.lines[3].get_xdata()] == [0.8, right]
-    assert (right, 0, ">") in cut_marks(axes, "<>")
+def test_claims_stand_in_their_place_with_boundaries_and_what_was_tested(analysis):
+    of_returns = {"task": "face_direction", "algorithm": "ddpg", "x": "dae-8", "y": "pca-4"}
+    verdict = Verdict(
+        **of_returns,
+        **{"claim": "not worse", "verdict": "supported", "boundary": -90.0},
+        estimate=Interval(200.0, 150.0, 250.0),
+        interval=Interval(200.0, 145.0, 255.0),
+    )
+    faster = replace(verdict, claim="faster", estimate=Interval(-1e4, -2e4, 0.0))
+    axes, rows = difference_panel(replace(analysis.groups[0], verdicts=(verdict, faster)), analysis)
+    tested, thick, _, boundary = axes.lines
+    assert [[*line.get_xdata()] for line in (tested, thick)] == [[145, 255], [150, 250]]
+    assert boundary.get_xdata()[0] == -90 > axes.get_xlim()[0]
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["dae-8 not worse than pca-4"]
+    assert rows[0][2:6] == ("dae-8", "pca-4", "not worse", "supported")
+
+
+def test_an_interval_far_beyond_or_without_an_end_is_drawn_to_the_edge(analysis):
+    (group, *_), far = analysis.groups, Interval(100.0, -1e9, np.inf)
+    numbers = group.comparisons[0].numbers | {"final_return_difference": far}
+    comparisons = (replace(group.comparisons[0], numbers=numbers), *group.comparisons[1:])
+    axes, _ = difference_panel(replace(group, comparisons=comparisons), analysis)
+    left, right = axes.get_xlim()
+    assert -2000 < left < right < 2000
+    assert [*axes.lines[1].get_xdata()] == [left, right]
+    assert {(left, 0, "<"), (right, 0, ">")} == {*cut_marks(axes, "<>")}
 
 
 def test_a_profile_falls_from_all_runs_to_none(analysis):
@@ -379,7 +392,7 @@ def test_diagrams_show_what_any_method_does():
 
 
 def test_pages_have_a_light_and_a_dark_style(plots):
-    plot = plots["claims"]
+    plot = plots["differences"]
     light, dark = plot.on_paper.picture("svg"), Drawing(plot.draw, DARK).picture("svg")
     assert b"#dddddd" in dark.lower()
     assert b"#dddddd" not in light.lower()

@@ -109,7 +109,7 @@ def test_trials_take_rollouts_as_short_as_can_be(algorithm, short):
 
 
 def test_codes_that_are_larger_than_the_observation_take_more_memory(tmp_path, monkeypatch):
-    data = Data(steps=1000)
+    data = {"": Data(steps=1000)}
     study = STUDY.replace(algorithms=("sac-modern",), steps=1_000_000, data=data)
     gib = 1 << 30
     monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 4, "SC_PAGE_SIZE": gib}.__getitem__)
@@ -119,7 +119,7 @@ def test_codes_that_are_larger_than_the_observation_take_more_memory(tmp_path, m
 
 def test_codes_that_are_larger_than_the_observation_have_packs_of_their_own(tmp_path):
     """They can't be in one cohort with others, so in one pack they would wait for it to end."""
-    codes = {"representations": ("full", "dae-8", "noise-38"), "data": Data(steps=1000)}
+    codes = {"representations": ("full", "dae-8", "noise-38"), "data": {"": Data(steps=1000)}}
     packs = packs_of(tmp_path, 2, algorithms=("sac-modern",), **codes)
     seen = [{cell.representation.name for cell in pack} for pack in packs]
     assert all(names == {"noise-38"} or "noise-38" not in names for names in seen)

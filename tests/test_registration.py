@@ -2,28 +2,32 @@
 
 import hashlib
 import json
-import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
 from command import in_this_process, jbrep
 from made_up import COMMITS, of_a_commit
 from small import forge
-from test_study import TINY, written
+from test_study import TINY
 
-from jbrep.encoders import load
+from jbrep.encoders import find, load, save
 from jbrep.errors import InputError
-from jbrep.records.document import read_document
-from jbrep.report.tables import read_tables
+from jbrep.records.document import read_document, sealed
 from jbrep.rl.files import RUN, read_run, runs_below
-from jbrep.stats.scale import CONSTANT, STILL
+from jbrep.rl.shipped import file_of
 from jbrep.study.config import Data, read_study
 from jbrep.study.plan import Plan
+from jbrep.study.prepare import prepare
 from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.registration import REGISTRATION, read_registration
+from jbrep.study.registration import (
+    REGISTRATION,
+    Registration,
+    find_committed,
+    read_registration,
+)
 from jbrep.study.results import write_tables
 from jbrep.study.runner import register_study, run_study
-from jbrep.study.tables import REFERENCE_RETURNS
 
 ROOT = Path(__file__).parent.parent
 TINIER = TINY.replace(representations=("full",), seeds=(0, 1))
@@ -40,47 +44,158 @@ def registered(tmp_path_factory):
     return Plan(TINIER, folder)
 
 
+def git(folder, *arguments):
+    """A command of git, as someone."""
+    who = ("-c", "user.name=It", "-c", "user.email=it@it", "-c", "commit.gpgsign=false")
+    subprocess.run(["git", "-C", str(folder), *who, *arguments], check=True, capture_output=True)
+
+
+@pytest.fixture
+def repository(tmp_path):
+    folder = tmp_path / "repository"
+    folder.mkdir()
+    git(folder, "init")
+    return folder
+
+
+def commit(folder):
+    git(folder, "add", "-A")
+    git(folder, "commit", "-m", "it")
+
+
+CLAIMS = TINY.replace(
+    seeds=tuple(range(8)),
+    steps=16,
+    evaluate_every=16,
+    verdicts={"claims": ["pca-8 better than full"]},
+)
+
+
 def test_a_plan_is_written_down(tmp_path):
-    command = ("study", written(tmp_path), "--out", tmp_path / "out", "--register")
+    """Beside its file, at once: nothing is made."""
+    study = TINIER.replace(
+        representations=("full", "dae-8"), data={"": Data(steps=10**9, policy="trained")}
+    )
+    (tmp_path / "it.toml").write_text(study.toml())
+    command = ("study", tmp_path / "it.toml", "--out", tmp_path / "out", "--register")
     told = jbrep(*command)
     assert told.exit_code == 0, told.output
-    registration = read_registration(tmp_path / "out")
+    path = tmp_path / "it.registration.json"
+    registration = read_document(path, Registration)
     assert registration.sha256 in told.output
-    assert str(tmp_path / "out" / REGISTRATION) in told.output
-    assert registration.study["seeds"] == [0, 1]
+    assert str(path) in told.output
+    assert registration.registered == study
+    assert registration.encoders == {}
+    sha256 = hashlib.sha256(file_of("face_direction").read_bytes()).hexdigest()
+    assert registration.policies == {"data/face_direction/policy-0.safetensors": sha256}
+    assert not registration.committed
     assert registration.versions.keys() >= {"jbrep", "torch", "stable-baselines3"}
-    assert not list((tmp_path / "out").rglob(RUN))
+    assert not (tmp_path / "out").exists()
+    before = path.read_bytes()
     assert jbrep(*command).exit_code == 0  # the same once more
-    assert read_registration(tmp_path / "out") == registration
+    assert path.read_bytes() == before
+    (tmp_path / "it.toml").write_text(study.replace(steps=90).toml())
+    assert jbrep(*command).exit_code == 0
+    assert read_document(path, Registration).registered.steps == 90
 
 
-def test_encoders_that_the_study_makes_are_registered_by_their_hashes(tmp_path):
-    """So it is told if other ones ran, as of data or by code that changed since."""
-    codes = ("pca-2", {"name": "random-2", "encoders": 2})
-    study = TINIER.replace(
-        representations=("full", *codes), data=Data(steps=1000), steps=16, evaluate_every=16
-    )
+def test_only_encoders_that_are_there_beforehand_are_registered(tmp_path):
+    path = tmp_path / "mine.safetensors"
+    save(find("pca-8", "face_direction"), path)
+    mine = {"name": "mine", "file": str(path)}
+    plan = Plan(TINIER.replace(representations=("pca-4", mine)), tmp_path / "shipped")
+    register_study(plan)
+    shas = {"pca-4": find("pca-4", "face_direction"), "mine": load(path)}
+    assert plan.registration.encoders == {
+        cell.name: shas[cell.representation.name].fingerprint for cell in plan.cells
+    }
+    data = {"": Data(steps=1000)}
+    plan = Plan(TINIER.replace(representations=("full", mine), data=data), tmp_path / "made")
+    register_study(plan)
+    assert {name.split("/")[2] for name in plan.registration.encoders} == {"mine"}
+    assert not (plan.folder / "data").exists()
+
+
+def test_other_policies_and_data_than_were_registered_are_told(collected, tmp_path):
+    data = {"": Data(steps=100, policy="uniform:0.5+trained:0.5")}
+    study = TINIER.replace(data=data, episode_steps=50)
     plan = Plan(study, tmp_path / "study")
     with of_a_commit():
-        registration = register_study(plan)
-    assert not list(plan.folder.rglob(RUN))
-    made = {path.stem: load(path) for path in plan.encoders("face_direction").glob("*.safetensors")}
-    assert registration.encoders == {
-        f"face_direction/a2c/{code}/seed-{seed}": made[name].fingerprint
-        for seed in (0, 1)
-        for code, name in (
-            ("full", "full"),
-            ("pca-2", "pca-2"),
-            ("random-2", f"random-2-s{seed}"),
-        )
-    }
+        register_study(plan)
+    prepare(plan)
+    (name,) = plan.registration.policies
+    assert plan.policies == plan.registration.policies
+    assert plan.deviations([]) == []
+    plan.registration = plan.registration.replace(policies={name: "0" * 64})
+    assert plan.deviations([]) == [
+        f"other policies than were registered collected data: {name}",
+    ]
+    there = Plan(TINIER.replace(data={"": Data(folder=str(collected))}), tmp_path / "there")
     with of_a_commit():
-        assert run_study(Plan(study, plan.folder), in_this_process, 1) == 0
-    runs = [read_run(folder) for folder in runs_below(plan.folder)]
-    assert registration.deviations(study, runs) == []
-    name = runs[-1].settings.name
-    other = registration.replace(encoders={**registration.encoders, name: "0" * 64})
-    assert "1 of its runs have other encoders than were registered" in other.deviations(study, runs)
+        register_study(there)
+    assert there.deviations([]) == []
+    there.registration = there.registration.replace(data={str(collected): "0" * 64})
+    (told,) = there.deviations([])
+    assert str(collected) in told
+
+
+def test_claims_in_a_work_tree_run_once_they_are_committed(repository, tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.report.report.write_report", lambda tables, out: [out])
+    path, out = repository / "it.toml", tmp_path / "out"
+    beside = repository / "it.registration.json"
+    path.write_text(CLAIMS.toml())
+    commit(repository)
+    run = ("study", path, "--out", out, "--workers", 1)
+
+    def refused():
+        told = jbrep(*run)
+        assert (told.exit_code, out.exists()) == (2, False)
+        assert str(beside) in told.stderr
+        assert "--register" in told.stderr
+
+    refused()
+    told = jbrep("study", path, "--register", "--out", out)
+    assert told.exit_code == 0, told.output
+    assert "Commit it.registration.json" in told.stderr
+    refused()  # as it isn't in a commit
+    commit(repository)
+    whole = beside.read_text()
+    beside.write_text(whole + " ")
+    refused()
+    beside.write_text(whole)
+    path.write_text(CLAIMS.replace(steps=32).toml())
+    refused()  # as it is of another study
+    path.write_text(CLAIMS.toml())
+    plan = Plan(CLAIMS, out, path)
+    assert run_study(plan, in_this_process, 1) == 0
+    assert (out / REGISTRATION).read_text() == whole
+    registration = read_registration(out)
+    assert registration.committed
+    runs = [read_run(folder) for folder in runs_below(out)]
+    assert {each.settings.registration for each in runs} == {registration.sha256}
+    beside.unlink()
+    assert jbrep("study", path, "--out", out, "--register").exit_code == 2  # there are runs
+    registration.replace(date="2000-01-01T00:00:00+00:00").write(beside)
+    commit(repository)
+    with pytest.raises(InputError, match="registered otherwise"):
+        run_study(Plan(CLAIMS, out, path), in_this_process, 1)
+
+
+def test_without_claims_a_study_needs_no_registration_but_keeps_to_one(repository, tmp_path):
+    path = repository / "it.toml"
+    path.write_text(TINIER.toml())
+    commit(repository)
+    assert find_committed(path, TINIER) is None
+    register_study(Plan(TINIER, tmp_path / "it", path))
+    with pytest.raises(InputError, match=r"it\.registration\.json isn't as in the last commit"):
+        run_study(Plan(TINIER, tmp_path / "it", path), in_this_process, 1)
+    commit(repository)
+    assert find_committed(path, TINIER).registered == TINIER
+    begun = Plan(TINIER, tmp_path / "it", path)
+    begun.folder_of(begun.cells[0]).mkdir(parents=True)
+    (begun.folder_of(begun.cells[0]) / RUN).write_text("{}")
+    with pytest.raises(InputError, match="has runs"):
+        begun.register(find_committed(path, TINIER))
 
 
 def test_what_ran_as_registered_says_so(registered):
@@ -149,30 +264,6 @@ def test_code_that_cannot_be_compared_is_told(commit, told, registered):
     assert found == told
 
 
-def test_a_policy_that_came_later_changes_no_registered_study(tmp_path):
-    """Gains count over the better of standing still and random actions, as was registered then."""
-    folder = shutil.copytree(ROOT / "results" / "answer-face-direction", tmp_path / "study")
-    path = folder / REFERENCE_RETURNS
-    rows = [row for row in path.read_text().splitlines() if CONSTANT not in row]
-    drive = [row.replace("standing still", CONSTANT).rsplit(",", 1) for row in rows[1:6]]
-    assert all(CONSTANT in row for row, _ in drive)
-    path.write_text("\n".join([*rows, *(f"{row},900.0" for row, _ in drive)]) + "\n")
-    record = read_document(folder / RECORD, RunsRecord)
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    record.replace(tables={**record.tables, REFERENCE_RETURNS: sha256}).write(folder / RECORD)
-    (group,) = read_tables(folder).analysis.groups
-    assert group.references[CONSTANT].value == 900
-    assert group.reference_policy == STILL
-    assert round(group.reference) == 251
-
-
-def test_a_registration_that_is_gone_is_named(tmp_path):
-    folder = shutil.copytree(ROOT / "results" / "answer-face-direction", tmp_path / "study")
-    (folder / REGISTRATION).unlink()
-    with pytest.raises(InputError, match=r"registration.json is missing: put it back"):
-        read_tables(folder)
-
-
 def test_a_registration_comes_first_and_stays_as_it_is(tmp_path):
     plan = Plan(TINIER, tmp_path / "late")
     register_study(plan)
@@ -197,26 +288,25 @@ def test_a_registration_without_a_study_is_refused(registered, tmp_path):
     "path", sorted((ROOT / "results").glob(f"*/{REGISTRATION}")), ids=lambda p: p.parent.name
 )
 def test_the_committed_results_are_of_the_studies_that_were_registered(path):
-    registration = read_registration(path.parent)
-    study = read_study(ROOT / "studies" / f"{path.parent.name}.toml")
-    assert not registration.differences(study)
+    """Of releases up to 0.3 the registration is a witness that nothing reads: its seal holds."""
+    given = json.loads(path.read_text())
+    assert given["sha256"] == sealed(given)["sha256"]
     record = read_document(path.with_name(RECORD), RunsRecord)
-    assert record.registration.sha256 == registration.sha256
-    assert not registration.differences(record.study)
+    assert record.registration.sha256 == given["sha256"]
+    study = read_study(ROOT / "studies" / f"{path.parent.name}.toml")
+    assert record.study.replace(title="", evaluations=()) == study.replace(title="", evaluations=())
 
 
-def test_a_study_with_primary_cells_is_registered_when_it_begins(tmp_path):
+def test_a_study_with_claims_is_registered_when_it_begins(tmp_path):
     """Without a registration before the first run, there are no verdicts."""
-    primary = {"primary": ["face_direction/a2c/pca-8"], "failing": 0.4}
-    seeds = tuple(range(8))
-    study = TINY.replace(seeds=seeds, steps=16, evaluate_every=16, verdicts=primary)
-    plan = Plan(study, tmp_path / "study")
+    plan = Plan(CLAIMS, tmp_path / "study")
     assert run_study(plan, in_this_process, 1) == 0
-    again = Plan(study, tmp_path / "study")
+    again = Plan(CLAIMS, tmp_path / "study")
+    assert "its registration is in no commit" in again.deviations([])
     judging = again.registration.registered.planned
-    assert (judging.rules.primary, judging.seeds) == (tuple(primary["primary"]), seeds)
+    assert (judging.rules.claims, judging.seeds) == (CLAIMS.verdicts.claims, CLAIMS.seeds)
     for path in (tmp_path / "study").rglob(RUN):
         settings = json.loads(path.read_text())["settings"]
         assert settings["registration"] == again.registration.sha256
     (again.folder / REGISTRATION).unlink()
-    assert Plan(study, tmp_path / "study").registration is None
+    assert Plan(CLAIMS, again.folder).registration is None

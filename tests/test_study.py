@@ -97,7 +97,11 @@ def done(tmp_path_factory):
 def test_the_studies_that_come_along_are_studies(path, tmp_path):
     study = read_study(path)
     if path.stem == "paper":
-        assert (study.steps, len(study.seeds), study.data) == (5_000_000, 10, Data(steps=5_000_000))
+        assert (study.steps, len(study.seeds), study.data) == (
+            5_000_000,
+            10,
+            {"": Data(steps=5_000_000)},
+        )
         assert {"dae-12", "dae-8", "dae-4", "full"} <= {*study.representations}
     assert as_study(tomllib.loads(study.toml())) == study
     ready = all(isinstance(each, ByName) for each in study.observed)  # else made by others first
@@ -188,7 +192,7 @@ def test_a_study_without_seeds_or_with_settings_of_no_encoder_is_refused():
     with pytest.raises(InputError, match="seeds is missing"):
         as_study({"tasks": ["face_direction"], "algorithms": ["a2c"], "representations": ["full"]})
     with pytest.raises(InputError, match=r"unknown training\.depth"):
-        TINY.replace(representations=("full",), data=Data(steps=9), training={"depth": 3})
+        TINY.replace(representations=("full",), data={"": Data(steps=9)}, training={"depth": 3})
 
 
 @pytest.mark.parametrize("representations", [("pca-8",), ("full",)])
@@ -211,7 +215,7 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
     few = TINY.replace(algorithms=("sac-wide",), seeds=(0,)).notices
     assert few[0] == "This study compares nothing: it has one seed."
     assert few[1].startswith("sac-wide learns from step 25,600 on: ")
-    assert TINY.replace(data=Data(steps=1000)).notices == TINY.notices[:1]
+    assert TINY.replace(data={"": Data(steps=1000)}).notices == TINY.notices[:1]
     path = written(tmp_path, f"representations = {json.dumps(representations)}")
     monkeypatch.setattr("jbrep.study.packing.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
@@ -248,7 +252,7 @@ def test_arguments_and_time_limit_are_those_of_the_environments(tmp_path):
     [
         ({"environment": {"spring": 1}}, "can't make Pendulum-v1 with {'spring': 1}"),
         (
-            {"representations": ("full", "pca-4"), "data": Data(steps=9)},
+            {"representations": ("full", "pca-4"), "data": {"": Data(steps=9)}},
             "choose a latent size of at most 3",
         ),
         (
@@ -351,16 +355,16 @@ def test_it_makes_data_and_encoders(tmp_path, monkeypatch):
     """Only the Jitterbug's tasks are derived from each other."""
     derived = []
 
-    def derive(source, task, folder):
+    def derive(source, task, folder, **given):
         derived.append(task)
-        return derive_really(source, task, folder)
+        return derive_really(source, task, folder, **given)
 
     derive_really = prepare_module.derive
     monkeypatch.setattr(prepare_module, "derive", derive)
     study = TINY.replace(
         tasks=("Pendulum-v1", "face_direction", "move_to_pose"),
         representations=("full", "dae-2", "random-1"),
-        data=Data(steps=2000, seed=5),
+        data={"": Data(steps=2000, seed=5)},
         training={"epochs": 2, "batch_size": 256},
     )
     plan = Plan(study, tmp_path / "made")
@@ -383,7 +387,7 @@ def test_it_makes_data_and_encoders(tmp_path, monkeypatch):
 
 def test_a_data_set_from_elsewhere(collected, tmp_path):
     for folder in (collected, collected.parent):
-        study = TINY.replace(data=Data(folder=str(folder)))
+        study = TINY.replace(data={"": Data(folder=str(folder))})
         plan = Plan(study, tmp_path / folder.name)
         prepare(plan)
         assert (plan.encoders("face_direction") / "pca-8.safetensors").exists()
@@ -392,7 +396,10 @@ def test_a_data_set_from_elsewhere(collected, tmp_path):
         ({"representations": ("full", "pca-17")}, "pca-17 can't be trained for face_direction: la"),
         ({"representations": ("full", "pca-99")}, "latent size is 99"),
         (five, r"no encoder 'pca-5' ships for .*: choose one of coordinates, dae-12"),
-        ({"tasks": ("move_to_pose",), "data": Data(folder=str(collected))}, "made for face_direc"),
+        (
+            {"tasks": ("move_to_pose",), "data": {"": Data(folder=str(collected))}},
+            "made for face_direc",
+        ),
     ):
         with pytest.raises(InputError, match=message):
             run_study(Plan(study.replace(**changes), tmp_path / "wrong"), None, 1)
@@ -666,7 +673,7 @@ def test_a_run_is_drawn_before_and_after_training_with_the_same_body(done):
 def test_tasks_may_come_and_go_whichever_was_collected(tmp_path):
     def prepared(*tasks):
         study = TINY.replace(
-            tasks=tasks, representations=("full", "random-1"), data=Data(steps=1000)
+            tasks=tasks, representations=("full", "random-1"), data={"": Data(steps=1000)}
         )
         plan = Plan(study, tmp_path / "made")
         plan.write()

@@ -293,7 +293,7 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     nested = {"name": "random-4", "encoders": 2}
     files = {"name": "mine", "file": "encoders/{task}/mine-{encoder}.safetensors", "encoders": 2}
     own = {"name": "late-4", "kind": "slow", "latent": 4, "lags": [20]}
-    few = {"seeds": (0, 1, 2), "data": Data(folder=str(collected))}
+    few = {"seeds": (0, 1, 2), "data": {"": Data(folder=str(collected))}}
     with pytest.raises(InputError, match=r"2 encoders for 3 seeds: .* so give at most 1, or 3"):
         with_own(nested, files, own, **few)
     study = with_own(nested, files, own, **(few | {"seeds": (0, 1, 2, 3, 4)}))
@@ -329,7 +329,7 @@ def test_each_encoder_of_several_learns_from_its_own_data(tmp_path):
         tasks=tasks,
         representations=several,
         seeds=tuple(range(6)),
-        data=Data(steps=400, seed=5, sets=2),
+        data={"": Data(steps=400, seed=5, sets=2)},
     )
     plan = Plan(study, tmp_path / "it")
     prepare(plan)
@@ -359,7 +359,7 @@ def test_each_encoder_of_several_learns_from_its_own_data(tmp_path):
     ],
 )
 def test_settings_of_encoders_are_checked_with_the_data(own, message, tmp_path, collected):
-    study = with_own(own, data=Data(folder=str(collected)))
+    study = with_own(own, data={"": Data(folder=str(collected))})
     with pytest.raises(InputError, match=message):
         run_study(Plan(study, tmp_path / "it"), None, 1)
     assert not (tmp_path / "it").exists()
@@ -431,7 +431,7 @@ def test_own_encoders_are_checked_before_the_first_run(own, message, home, tmp_p
 )
 def test_a_mistaken_representation_is_refused(given, message):
     with pytest.raises(InputError, match=message) as error:
-        as_study({**to_plain(TINY), "data": {"steps": 9}, "representations": given})
+        as_study({**to_plain(TINY), "data": {"steps": 9, "sets": 1}, "representations": given})
     assert "\n" not in str(error.value)
 
 

@@ -80,16 +80,14 @@ def cells(known: pd.DataFrame, bounds: Bounds) -> Iterator[tuple[str, str, str]]
     """A row for each representation, the baseline first, and for each policy."""
     runs, policies = known[known["seed"].notna()], known[known["seed"].isna()]
     by_policy = policies.groupby("representation", sort=False)["value"].mean().to_dict()
-    finals = {
-        str(name): each.groupby("seed")["value"].mean().to_numpy(float)
-        for name, each in runs.groupby("representation")
-    }
+    finals = runs.pivot_table("value", "seed", "representation")
     blind = best_blind(by_policy)
     assert blind
     for name in sorted(finals, key=lambda name: (name != BASELINE, name)):
-        of_baseline = finals[name], finals[BASELINE], by_policy[blind]
-        share = shown(share_of_gain(*of_baseline, bounds, LEVEL), ".2f")
-        mean = shown(mean_within(finals[name], bounds, LEVEL), ".0f")
+        pairs = finals[[name, BASELINE]].dropna().to_numpy(float).T  # of the seeds of both
+        share = shown(share_of_gain(*pairs, by_policy[blind], LEVEL), ".2f")
+        own = finals[name].dropna().to_numpy(float)
+        mean = shown(mean_within(own, bounds, LEVEL), ".0f")
         yield name, mean, "" if name == BASELINE else share
     for policy, value in by_policy.items():
         yield policy, f"{value:.0f}", ""

@@ -36,7 +36,8 @@ from jbrep.study.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, interval, number
 
 SCORES, LEARNED = "scores", "learned.csv"
-REWARDED, SHORT, WHOLE = "rewarded", "a short run", "a whole run"
+REWARDED, REWARD, SIZE = "rewarded", "reward", "how many numbers"
+SHORT, WHOLE = "a short run", "a whole run"
 SHORT_STEPS = 50_000  # until the first evaluation after them: half a minute
 PRIMARY, LEAST, LEAST_LOW = "trees", 0.8, 0.6  # the mean over tasks, and its interval's low end
 APART = 0, 0.05, 0.1, 0.2  # differences in *rewarded*, from each to the next
@@ -105,8 +106,10 @@ def scores(evaluation: Evaluation, path: Path) -> dict[str, dict[str, float]]:
         InputError: something was learned from other encoders than those that were judged.
     """
     found = {
-        REWARDED: {code: headline(e)[REWARDED] or 0.0 for code, e in evaluation.encoders.items()}
+        name: {code: headline(e)[name] or 0.0 for code, e in evaluation.encoders.items()}
+        for name in (REWARDED, REWARD)
     }
+    found[SIZE] = {code: float(e.latent) for code, e in evaluation.encoders.items()}
     if path.exists():
         with path.open(newline="") as file:
             for row in csv.DictReader(file):

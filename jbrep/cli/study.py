@@ -40,7 +40,7 @@ _COUNT = click.IntRange(1, 1024)
 @click.option(
     "--register",
     is_flag=True,
-    help="Make data and encoders, and write down the plan, with their hashes and the code's "
+    help="Write down the plan beside STUDY, with the hashes of what is there and the code's "
     "version, before the first run.",
 )
 @import_option
@@ -60,8 +60,8 @@ def study(
 
     STUDY is a TOML file of tasks, algorithms, representations and seeds, such as those in studies/.
     Tasks are the Jitterbug's, by their names, and any environments, by their Gymnasium ids.
-    Data sets and encoders are made first. Stopped or killed, the same command resumes the study;
-    runs that have ended are never run again.
+    One with claims is registered first, in a commit; then data sets and encoders are made. Stopped
+    or killed, the same command resumes the study; runs that have ended are never run again.
     """
     from jbrep.errors import InputError, choose
     from jbrep.records.storage import exists
@@ -95,21 +95,24 @@ def _announce(
     path: Path, folder: Path, dry_run: bool, workers: int | None, width: int | None
 ) -> None:
     """Say what a study is going to do, or write it down before the first run."""
+    from jbrep.records.document import read_document
     from jbrep.report.statistics import forecast_text
     from jbrep.study import Plan, read_study, register_study
     from jbrep.study.packing import forecast
-    from jbrep.study.registration import REGISTRATION
+    from jbrep.study.registration import Registration
 
-    plan = Plan(read_study(path), folder)
+    plan = Plan(read_study(path), folder, path)
     expected = forecast(plan, workers, width) if dry_run else None
     for notice in plan.study.notices:
         tell(notice, err=True)
     if expected:
         return click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
-    with stoppable(RESUMES):
-        registered = register_study(plan)
-    click.echo(f"registered on {registered.date} (SHA-256 {registered.sha256})")
-    return echo_paths([plan.folder / REGISTRATION])
+    registered = register_study(plan)
+    found = read_document(registered, Registration)
+    click.echo(f"registered on {found.date} (SHA-256 {found.sha256})")
+    if plan.in_git:
+        tell(f"Commit {registered.name}, then run the study: before, it is refused.", err=True)
+    return echo_paths([registered])
 
 
 @click.command(epilog="Example: jbrep report runs/demo")

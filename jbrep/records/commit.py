@@ -22,22 +22,36 @@ Commits = Mapping[
 
 @cache
 def commits() -> Commits:
-    """The commits of jbrep and of the working directory, each where it is in a git repository.
+    """The last commits of jbrep's code and of the working directory, where git knows them.
 
-    A commit is 40 hexadecimal digits (64 with SHA-256), with "+changes" after them if files that
-    git tracks differ from it. They are those of the first call in a process.
+    That of a folder is the last one that changed a file there, so that a commit of something else,
+    such as a registration, leaves it as it was. It is 40 hexadecimal digits (64 with SHA-256), with
+    "+changes" after them if files that git tracks differ from it. They are those of the first call
+    in a process.
     """
     places = {"jbrep": Path(__file__).resolve().parent, "work": Path.cwd()}
     known = {name: _commit(folder) for name, folder in places.items()}
     return MappingProxyType({name: commit for name, commit in known.items() if commit})
 
 
+def in_work_tree(path: Path) -> bool:
+    """Whether a file lies in a git repository's work tree."""
+    return _git(path.absolute().parent, "rev-parse", "--is-inside-work-tree") == "true"
+
+
+def is_committed(path: Path) -> bool:
+    """Whether a file is as its repository's last commit has it."""
+    folder = path.absolute().parent
+    there = _git(folder, "rev-parse", "--verify", f"HEAD:./{path.name}")
+    return bool(there) and there == _git(folder, "hash-object", "--", path.name)
+
+
 def _commit(folder: Path) -> str:
-    """The commit of the repository that a folder is in; empty if there is none, or no git."""
+    """The last commit that changed a folder; empty if there is none, or no git."""
     if "site-packages" in folder.parts:
         return ""  # installed in an environment that may lie in another project's repository
-    commit = _git(folder, "rev-parse", "HEAD")
-    changes = commit and _git(folder, "status", "--porcelain", "--untracked-files=no")
+    commit = _git(folder, "log", "-1", "--format=%H", "--", ".")
+    changes = commit and _git(folder, "status", "--porcelain", "--untracked-files=no", "--", ".")
     return f"{commit}{CHANGES}" if changes else commit
 
 

@@ -1,15 +1,13 @@
 """The answer of a study in a few sentences: what agents return, which learned, what is decided."""
 
-import math
 from collections.abc import Iterable, Sequence
 
 from jbrep.report.returns import by_task, named, shown_return
 from jbrep.report.tables import Tables
-from jbrep.report.words import enumerated, over
+from jbrep.report.words import conclusion, enumerated
 from jbrep.stats.analysis import Analysis, GroupAnalysis
-from jbrep.stats.arms import FEWEST_UNITS
-from jbrep.stats.claims import CONTRADICTED, EXPLORATORY, NOT_YET, SUPPORTED, UNDECIDED, Verdict
 from jbrep.stats.labels import NO, UNCLEAR, YES, RepresentationResult
+from jbrep.stats.pairs import FEWEST_UNITS
 from jbrep.stats.scale import LOOKING
 from jbrep.text import counted
 
@@ -93,74 +91,36 @@ def _learnt(agents: Sequence[tuple[str, RepresentationResult]]) -> str:
 
 
 def _conclusion(analysis: Analysis) -> Iterable[str]:
-    """What can be concluded of the comparisons with the baseline."""
+    """What is decided, and what can be said of comparisons with the baseline."""
+    if verdicts := analysis.verdicts:
+        yield conclusion(verdicts)
     compared = [group for group in analysis.groups if group.comparisons]
     if not compared:
         yield f"Nothing was compared with {analysis.baseline}."
         return
-    silent = [group for group in compared if group.labels[0].learnt != YES]
-    if silent:
+    if silent := [group for group in compared if group.labels[0].learnt != YES]:
         surely = "" if all(group.labels[0].learnt == NO for group in silent) else "clearly "
         where = f" on {enumerated([group.name for group in silent])}" if len(compared) > 1 else ""
-        what = "but what was registered " if any(group.is_judged for group in silent) else ""
         yield (
-            f"Agents on {analysis.baseline} didn't {surely}learn{where}: nothing {what}can be "
-            f"compared {'there' if where else 'with them'}{_enough(analysis, silent)}."
+            f"Agents on {analysis.baseline} didn't {surely}learn{where}: nothing else can be "
+            f"compared with them{' there' if where else ''}."
         )
-    cells = [(group, each) for group in compared for each in group.comparisons]
-    judged = [(group, each) for group, each in cells if each.is_judged]
-    if judged:
-        several = len(compared) > 1
-        yield from _decided(
-            analysis.planned.rules.claims,
-            [
-                (f"{c.representation} ({g.name})" if several else c.representation, c.verdicts)
-                for g, c in judged
-            ],
-        )
-        if analysis.planned.rules.gains_over != "drives":
-            yield f"As it was registered, gains count over {over(analysis.planned.rules)}."
-    elif analysis.planned.rules.primary:
-        yield (
-            "Nothing is decided yet: there are no statistics of what was registered, which take "
-            "two runs a side."
-        )
-    elif len(silent) < len(compared):
+    if rising := _rising(analysis):
+        yield f"Still rising at the end of training: {rising}."
+    if not verdicts and len(silent) < len(compared):
         runs = [len(label.seeds) for group in compared for label in group.labels]
         each = counted(runs[0], "run") if len({*runs}) == 1 else f"{min(runs)} to {max(runs)} runs"
         none = ": no conclusion" if max(runs) < FEWEST_UNITS else ""
         yield f"With {each} of each and no claim registered, this is exploratory{none}."
 
 
-def _enough(analysis: Analysis, silent: Sequence[GroupAnalysis]) -> str:
-    """What was enough where verdicts have something to go by all the same."""
-    judged = (each for group in silent for each in group.comparisons if each.is_judged)
-    if all(math.isnan(each.verdicts[0].estimate.value) for each in judged):
-        return ""
-    return f"; for that it is enough to end above {over(analysis.planned.rules)} on these starts"
-
-
-def _decided(
-    claims: Sequence[str], cells: Sequence[tuple[str, Sequence[Verdict]]]
-) -> Iterable[str]:
-    """What is found of each claim that anything is decided of; then of all others."""
-    every = [verdict for _, verdicts in cells for verdict in verdicts]
-    if all(verdict.verdict == NOT_YET for verdict in every):
-        reasons = dict.fromkeys(verdict.reason or "" for verdict in every)
-        yield f"Nothing is decided yet: {'; '.join(reasons)}."
-        return
-    silent = []
-    for position, claim in enumerate(claims):
-        names = {
-            state: [name for name, verdicts in cells if verdicts[position].verdict == state]
-            for state in (SUPPORTED, CONTRADICTED, UNDECIDED, NOT_YET, EXPLORATORY)
-        }
-        if names[UNDECIDED] == [name for name, _ in cells]:
-            silent.append(repr(claim))
-            continue
-        told = [f"{state} for {enumerated(which)}" for state, which in names.items() if which]
-        is_decided = names[SUPPORTED] + names[CONTRADICTED]
-        yield f"{'Decided' if is_decided else 'Not decided'}: {claim!r} is {', '.join(told)}."
-    if silent:
-        verb = "is" if len(silent) == 1 else "are"
-        yield f"{enumerated(silent)} {verb} undecided{' everywhere' if len(cells) > 1 else ''}."
+def _rising(analysis: Analysis) -> str:
+    """The representations whose curves surely still rise, by task and algorithm."""
+    rising = {
+        group.name: [label.representation for label in group.labels if label.rises]
+        for group in analysis.groups
+    }
+    told = {name: ", ".join(which) for name, which in rising.items() if which}
+    if len(analysis.groups) == 1:
+        return "".join(told.values())
+    return "; ".join(f"{which} ({name})" for name, which in told.items())

@@ -11,13 +11,14 @@ from markupsafe import Markup
 
 from jbrep.progress import Progress
 from jbrep.records.tables import csv_text
-from jbrep.report import facts, words
+from jbrep.report import facts
 from jbrep.report.answer import answer
 from jbrep.report.figures.plot import Drawing, Plot
 from jbrep.report.figures.style import DARK, PAGE
 from jbrep.report.returns import returns_tables
-from jbrep.report.statistics import across_tasks, group_tables, matrix
+from jbrep.report.statistics import across_tasks, group_tables, verdict_tables
 from jbrep.report.tables import Tables
+from jbrep.report.words import notes
 from jbrep.stats import Analysis
 from jbrep.text import Table
 
@@ -32,42 +33,15 @@ def page(tables: Tables, plots: Sequence[Plot], predictions: Sequence[Table]) ->
     return template.from_string(_own("page.html.j2")).render(
         study=tables,
         facts=facts,
-        words=words,
         answer=answer(tables),
         returns=returns_tables(tables),
-        beside=_beside(analysis),
-        estimates=matrix,
-        how=_how(analysis) if analysis else "",
-        claims=words.statements(analysis.planned) if analysis else [],
+        verdicts=verdict_tables(analysis) if analysis else [],
+        how=notes(analysis.planned) if analysis else [],
         figures=[_figure(plot) for plot in Progress(plots, unit="figure", delay=1, leave=False)],
         tables=[*(_tables(analysis) if analysis else ()), *predictions],
         style=Markup(_own("page.css")),
         script=Markup(script),
         script_hash=_base64(hashlib.sha256(script.encode()).digest()),
-    )
-
-
-def _beside(analysis: Analysis | None) -> str:
-    """What comparisons with the baseline are called; empty where nothing can be compared."""
-    compared = [group for group in (analysis.groups if analysis else ()) if group.compared]
-    if not analysis or not compared:
-        return ""
-    return "Verdicts" if any(each.is_judged for each in compared) else f"Beside {analysis.baseline}"
-
-
-def _how(analysis: Analysis) -> str:
-    """How comparisons are to be read."""
-    if not any(group.is_judged for group in analysis.groups):
-        which = "Nothing was" if not analysis.planned.rules.primary else "None of these was"
-        return f"With 95 % intervals, from four runs on. {which} registered for a verdict."
-    return " ".join(
-        (
-            f"Each representation against {analysis.baseline}; open a cell for what it rests on. "
-            "Beside a verdict stands the interval that decides; other numbers have their 95 % "
-            "interval. A claim's unit of replication is the run, or the encoder where there are "
-            "eight or more.",
-            *words.notes(analysis.planned),
-        )
     )
 
 

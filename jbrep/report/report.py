@@ -19,7 +19,7 @@ from jbrep.report.page import page
 from jbrep.report.returns import returns_tables
 from jbrep.report.statistics import association_tables, results_text
 from jbrep.report.tables import Tables, check_tables, read_tables
-from jbrep.report.words import Answer, answers, notes, statements
+from jbrep.report.words import notes
 from jbrep.stats import Analysis
 from jbrep.stats.analysis import to_plain
 from jbrep.stats.association import Association, Diagnostic, associations
@@ -130,7 +130,6 @@ def write_report(tables: Tables, out: Path) -> list[Path]:
         InputError: the report can't be written.
     """
     make_folder(out)
-    verdicts = answers(tables.analysis) if tables.analysis else []
     associated = _associated(tables)
     plots = study_plots(
         tables.analysis, tables.returns, tables.references, tables.record.labels, associated
@@ -138,8 +137,8 @@ def write_report(tables: Tables, out: Path) -> list[Path]:
     predictions = association_tables(associated)
     texts = {
         PAGE: page(tables, plots, predictions),
-        SUMMARY: _json(_summary(tables, verdicts), indent=1),
-        MARKDOWN: markdown(tables, verdicts, predictions, f"{FIGURES}/{_MAIN_FIGURE}.png"),
+        SUMMARY: _json(_summary(tables), indent=1),
+        MARKDOWN: markdown(tables, predictions, f"{FIGURES}/{_MAIN_FIGURE}.png"),
     }
     write(plots, inside(out, FIGURES))
     if tables.analysis:
@@ -170,40 +169,30 @@ def _associated(tables: Tables) -> list[Association]:
 
 
 def statistics(analysis: Analysis) -> dict[str, Any]:
-    """All statistics for programs; an interval is [value, low, high], None if not finite.
-
-    Of comparisons that wait for the first look there are no numbers, as nowhere else.
-    """
+    """All statistics for programs; an interval is [value, low, high], None if not finite."""
     return {
         "format": "jbrep statistics",
-        "format_version": 4,
+        "format_version": 5,
         "baseline": analysis.baseline,
         "seed": analysis.seed,
-        "claims": [claim._asdict() for claim in statements(analysis.planned)],
         "notes": notes(analysis.planned),
-        "groups": to_plain(analysis.open_groups),
-        "aggregates": to_plain(tuple(analysis.open_aggregates)),
+        "groups": to_plain(analysis.groups),
+        "aggregates": to_plain(analysis.aggregates),
     }
 
 
-def _summary(tables: Tables, verdicts: Sequence[Answer]) -> dict[str, Any]:
+def _summary(tables: Tables) -> dict[str, Any]:
     """The summary for programs."""
     record = tables.record
     return {
         "format": "jbrep summary",
-        "format_version": 3,
+        "format_version": 4,
         "study": tables.name,
         "runs": len(record.runs),
         "missing": list(record.missing),
         "failed": [row[:2] for row in facts.failed_runs(tables).rows],
         "left_out": tables.left_out,
-        "claims": {
-            answer.claim.name: {
-                "counts": answer.counts,
-                "verdicts": [finding._asdict() for finding in answer.findings],
-            }
-            for answer in verdicts
-        },
+        "verdicts": to_plain(tables.analysis.verdicts) if tables.analysis else [],
         "numbers": {
             f"{group.task}/{group.algorithm}/{label.representation}": to_plain(label.numbers)
             for group in (tables.analysis.groups if tables.analysis else ())

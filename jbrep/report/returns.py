@@ -8,11 +8,10 @@ import numpy as np
 
 from jbrep.report.shares import Cells, share_cells
 from jbrep.report.tables import Tables
-from jbrep.report.words import reference_words, shown, shown_number
+from jbrep.report.words import scale_words, shown, shown_number
 from jbrep.stats.analysis import Analysis, GroupAnalysis
-from jbrep.stats.arms import FEWEST_UNITS
-from jbrep.stats.comparison import Comparison
 from jbrep.stats.labels import REACHED, RepresentationResult
+from jbrep.stats.pairs import FEWEST_UNITS
 from jbrep.stats.scale import LOOKING
 from jbrep.text import Table, possessive
 
@@ -51,26 +50,20 @@ def returns_tables(tables: Tables) -> list[Table]:
 def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: Cells) -> Table:
     """A row for each agent, then for each policy that doesn't learn; no column without content."""
     first = groups[0]
-    kept = {
-        comparison.representation: comparison for comparison in first.compared if comparison.is_open
-    }
-    form, best = return_form(groups), first.best_policy
-    counted_over_another = first.reference_policy != best
+    kept = {comparison.representation: comparison for comparison in first.compared}
+    form = return_form(groups)
     columns: dict[str, Callable[[RepresentationResult], str]] = {
         "runs": lambda label: str(len(label.seeds)),
         "failed": lambda label: str(len(label.failed) or "-"),
         "final return": lambda label: shown(label.numbers["final_return_mean"], form),
         "learned": lambda label: label.learnt,
-        f"over {best}": lambda label: (
-            shown_number(float(label.numbers["final_return_mean"].value) - first.blind.value, form)
-            if counted_over_another
-            else "-"
-        ),
+        "score": lambda label: shown(label.numbers["score"], ".2f"),
         f"of {possessive(analysis.baseline)} gain": lambda label: (
-            shown(kept[label.representation].verdicts[0].estimate, ".2f")
+            shown(kept[label.representation].numbers["share_of_gain"], ".2f")
             if label.representation in kept
             else "-"
         ),
+        "rise in the last fifth": lambda label: shown(label.numbers["rise"], form),
         **_share_columns(groups, shares),
     }
     rows = [(name, *(cell(label) for cell in columns.values())) for name, label in named(groups)]
@@ -83,23 +76,14 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
     title += f", {max(group.grid[-1] for group in groups):,.0f} steps"
     title += "; 95 % intervals over runs" if several else ""
     found = _without_nothing(Table(title, (what, *columns), rows))
-    if f"of {possessive(analysis.baseline)} gain" in found.header:
-        title += f"; {_gained(first, [*kept.values()])}"
+    title += f"; {scale_words(first, analysis.planned)}"
+    if first.cut and kept:
+        title += "; differences are taken as far as both curves go"
+    if any(comparison.by_encoder for comparison in kept.values()):
+        title += f"; of {FEWEST_UNITS} encoders or more, intervals are over encoders"
     if {*shares} & {*found.header} and any(label.failed for _, label in named(groups)):
         title += "; shares of episodes leave out runs that failed"
     return found._replace(title=title)
-
-
-def _gained(group: GroupAnalysis, kept: Sequence[Comparison]) -> str:
-    """What the column of gains is: over what they are, of which runs its shares."""
-    told = f"gains are over {group.reference_policy or reference_words(group)}"
-    if group.is_judged and group.reference_policy not in (None, group.best_policy):
-        told += ", as it was registered"
-    if not all(comparison.counts_all for comparison in kept):
-        told += "; shares are of the runs that verdicts count"
-    if any(comparison.verdicts[0].encoders for comparison in kept):
-        told += f"; of {FEWEST_UNITS} encoders or more, intervals of shares are over encoders"
-    return told + ("; shares compare each two as far as both go" if group.cut else "")
 
 
 def _share_columns(

@@ -13,27 +13,23 @@ from jbrep.report.shares import share_of, shares_of_runs
 from jbrep.report.tables import Tables
 from jbrep.report.words import (
     EFFECTS,
-    caveats,
-    deciding,
     notes,
-    over,
     probability,
-    reference_words,
-    remark,
     shown,
-    shown_number,
-    statements,
     told,
+    verdict_cells,
 )
 from jbrep.rl.files import FAILED
 from jbrep.stats.aggregates import Aggregate
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.association import Association
+from jbrep.stats.claims import FASTER
 from jbrep.stats.comparison import Comparison
 from jbrep.stats.labels import RepresentationResult
 from jbrep.stats.power import Prospect
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import SOLVED
+from jbrep.study.costs import Cost
 from jbrep.study.packing import Forecast
 from jbrep.study.plan import Cell
 from jbrep.study.tables import by_run
@@ -55,7 +51,7 @@ def results_text(tables: Tables, width: int | None = None, everything: bool = Fa
     """
     parts = [wrapped(each, width) for each in (*facts.notices(tables), *answer(tables))]
     if analysis := tables.analysis:
-        shown_first = [*returns_tables(tables), *decided_tables(analysis)]
+        shown_first = [*returns_tables(tables), *verdict_tables(analysis)]
         parts += [each.text(width) for each in shown_first]
         if everything:
             parts.append(statistics_text(analysis, width))
@@ -64,32 +60,14 @@ def results_text(tables: Tables, width: int | None = None, everything: bool = Fa
     return "\n\n".join(parts)
 
 
-def decided_tables(analysis: Analysis) -> list[Table]:
-    """What was tested: a table for each task and algorithm with primary cells."""
+def verdict_tables(analysis: Analysis) -> list[Table]:
+    """What was registered: a table for each task and algorithm."""
     found = []
     for group in analysis.groups:
-        decided = [
-            (comparison.representation, verdict)
-            for comparison in group.comparisons
-            for verdict in comparison.verdicts
-            if not math.isnan(verdict.level)
-        ]
-        rows = [
-            (
-                f"{name}: {verdict.claim}",
-                verdict.verdict,
-                "-" if math.isnan(verdict.interval.low) else deciding(verdict),
-            )
-            for name, verdict in decided
-        ]
-        boundaries = ", ".join(
-            f"{claim} {boundary:g}"
-            for claim, boundary in {v.claim: v.boundary for _, v in decided}.items()
-        )
-        title = f"{group.name}, boundaries: {boundaries}"
-        header = ("registered claim", "verdict", "interval that decides")
+        rows = [verdict_cells(verdict) for verdict in group.verdicts]
         if rows:
-            found.append(Table(title, header, rows))
+            title = f"{group.name}, registered claims"
+            found.append(Table(title, tuple(rows[0]), [tuple(row.values()) for row in rows]))
     return found
 
 
@@ -111,18 +89,12 @@ def _last(tables: Tables, width: int | None) -> str:
 
 
 def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[Table]:
-    """Up to five tables of a task and algorithm."""
+    """Up to four tables of a task and algorithm."""
     tables = [label_table(group), _spread_table(group)]
     if any(label.encoders > 1 for label in group.labels):
         tables.append(_component_table(group))
-    if any(comparison.is_open for comparison in group.compared):
-        tables.append(_comparison_table(group, analysis.baseline))
     if group.compared:
-        table = (
-            _verdict_table(group) if group.is_judged else _estimate_table(group, analysis.planned)
-        )
-        how = (*notes(analysis.planned), f"Gains are counted over {reference_words(group)}.")
-        tables.append(table._replace(title=f"{table.title}. {' '.join(how)}"))
+        tables.append(comparison_table(group, analysis.baseline))
     return tables
 
 
@@ -193,92 +165,38 @@ def _component_table(group: GroupAnalysis) -> Table:
     )
 
 
-def _comparison_table(group: GroupAnalysis, baseline: str) -> Table:
-    """A row for each comparison with the baseline, but for those that wait for a look."""
+def comparison_table(group: GroupAnalysis, baseline: str) -> Table:
+    """A row for each comparison with the baseline; differences are taken seed by seed."""
     form = return_form([group])
     return Table.of(
-        f"Compared with {baseline}",
-        [comparison for comparison in group.compared if comparison.is_open],
+        f"{group.name}, compared with {baseline}",
+        group.compared,
         {
             _KEY: _NAME,
             "final return": _number("final_return_difference", form),
+            "score": _number("score_difference", ".2f"),
+            "share of gain": _number("share_of_gain", ".2f"),
             "mean return": _number("mean_return_difference", form),
+            "steps to half of the gain": lambda comparison: told(
+                FASTER.name, comparison.numbers["steps_later"]
+            ),
             "P(improvement)": _number("probability_of_improvement", ".2f"),
+            "spread of curves": _number("spread_ratio", ".2f"),
             "variance ratio": _number("variance_ratio"),
-            "by bootstrap": _number("variance_ratio_bootstrap"),
             "Brown-Forsythe p": lambda comparison: probability(comparison.brown_forsythe_p),
         },
     )
 
 
-def _verdict_table(group: GroupAnalysis) -> Table:
-    """A row for each verdict, with the interval that decides and the boundary."""
-    return Table(
-        "Verdicts",
-        ("representation: claim", "verdict", "estimate", "boundary", "p", "level", "runs"),
-        [
-            (
-                f"{comparison.representation}: {verdict.claim}",
-                verdict.verdict + (f" ({verdict.reason})" if verdict.reason else ""),
-                told(
-                    verdict.claim,
-                    verdict.estimate if math.isnan(verdict.level) else verdict.interval,
-                ),
-                shown_number(verdict.boundary),
-                probability(verdict.p),
-                probability(verdict.level),
-                " and ".join(map(str, verdict.runs)),
-            )
-            for comparison in group.compared
-            for verdict in comparison.verdicts
-        ],
-    )
-
-
-def _estimate_table(group: GroupAnalysis, planned: Planned) -> Table:
-    """A row for each comparison without verdicts: estimates, where claims share one only once."""
-    claims = statements(planned)
-    heads = [claim.head for claim in claims]
-    columns = [i for i, each in enumerate(heads) if heads.index(each) == i]
-    return Table(
-        group.name,
-        (_KEY, *(heads[i] for i in columns)),
-        [
-            (
-                comparison.representation,
-                *(told(claims[i].name, comparison.verdicts[i].estimate) for i in columns),
-            )
-            for comparison in group.compared
-        ],
-    )
-
-
-def matrix(group: GroupAnalysis, planned: Planned) -> Table:
-    """A row for each comparison, a column for each claim; of estimates where nothing is judged."""
-    if not group.is_judged:
-        return _estimate_table(group, planned)
-    return Table(
-        "Verdicts",
-        (_KEY, *planned.rules.claims),
-        [
-            (
-                comparison.representation,
-                *("; ".join(filter(None, (v.verdict, remark(v)))) for v in comparison.verdicts),
-            )
-            for comparison in group.compared
-        ],
-    )
-
-
 def across_tasks(analysis: Analysis) -> list[Table]:
-    """A table for each algorithm that learned several tasks."""
+    """A table for each algorithm with scores on several tasks."""
     by_algorithm: dict[str, list[Aggregate]] = {}
-    for each in analysis.open_aggregates:
+    for each in analysis.aggregates:
         by_algorithm.setdefault(each.algorithm, []).append(each)
     return [
         Table.of(
-            f"{algorithm} across {', '.join(of_algorithm[0].tasks)}: gains over {_over(analysis)} "
-            f"as shares of that on {analysis.baseline}; 95 % intervals over runs within tasks",
+            f"{algorithm} across {', '.join(of_algorithm[0].tasks)}: scores; 95 % intervals over "
+            "runs within tasks",
             of_algorithm,
             {
                 _KEY: _NAME,
@@ -289,11 +207,6 @@ def across_tasks(analysis: Analysis) -> list[Table]:
         )
         for algorithm, of_algorithm in by_algorithm.items()
     ]
-
-
-def _over(analysis: Analysis) -> str:
-    known = all(group.reference_policy for group in analysis.groups)
-    return over(analysis.planned.rules) if known else "what each task's own table says"
 
 
 def association_tables(associated: list[Association]) -> list[Table]:
@@ -317,7 +230,7 @@ def association_tables(associated: list[Association]) -> list[Table]:
 
 
 def forecast_text(forecast: Forecast, planned: Planned, width: int | None = None) -> str:
-    """The runs to go, how long they would take, and what could be found in primary cells."""
+    """The runs to go, how long they would take, and what could be found of its claims."""
     summary = (
         f"{len(forecast.runs)} runs to go, {forecast.done} done; "
         f"{duration(forecast.seconds)} on one core, {duration(forecast.elapsed)} with "
@@ -325,10 +238,23 @@ def forecast_text(forecast: Forecast, planned: Planned, width: int | None = None
     )
     parts = [_to_go(forecast.runs).text(width)] if forecast.runs else []
     parts.append(wrapped(summary, width))
+    if forecast.made_first:
+        parts.append(_made_first(forecast.made_first).text(width))
     if forecast.prospects:
         parts.append(prospects_table(forecast.prospects).text(width))
-        parts += [wrapped(each, width) for each in (*notes(planned), *caveats(planned), EFFECTS)]
+        parts += [wrapped(each, width) for each in (*notes(planned), EFFECTS)]
     return "\n\n".join(parts)
+
+
+def _made_first(costs: Sequence[Cost]) -> Table:
+    """A row for the data sets of each name, and for the encoders of each representation."""
+    columns = {
+        "made first": lambda cost: cost.what,
+        "to go": lambda cost: str(cost.to_go),
+        "done": lambda cost: str(cost.done),
+        "time on one core": lambda cost: duration(cost.seconds),
+    }
+    return Table.of("", costs, columns)
 
 
 def _to_go(runs: Sequence[tuple[Cell, int, float]]) -> Table:
@@ -359,15 +285,17 @@ def _to_go(runs: Sequence[tuple[Cell, int, float]]) -> Table:
 
 
 def prospects_table(prospects: Sequence[Prospect]) -> Table:
-    """What can be found of each claim in each primary cell."""
+    """What can be found of each claim on each task and algorithm."""
     return Table.of(
         "",
         prospects,
         {
-            "primary cell: claim": lambda each: f"{each.cell}: {each.claim}",
-            "runs": lambda each: f"{each.arms.units} and {each.arms.baseline}",
+            "on": lambda each: each.where,
+            "claim": lambda each: str(each.claim),
+            "units": lambda each: str(each.units),
             "level": lambda each: probability(each.level),
             "least p": lambda each: probability(each.least_p),
             "power": lambda each: ", ".join(f"{100 * power:.0f} %" for power in each.power),
+            "unseen": lambda each: f"{100 * each.unseen:.0f} %",
         },
     )

@@ -1,6 +1,5 @@
 """The tables that a report is made from, read back from a study's folder, and their statistics."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,9 +10,7 @@ from jbrep.records.storage import exists
 from jbrep.records.tables import read_rows
 from jbrep.rl.files import ENCODER
 from jbrep.stats import Analysis
-from jbrep.stats.rules import Planned, Rules
 from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.registration import REGISTRATION, Registration, read_registration
 from jbrep.study.results import found
 from jbrep.study.tables import (
     REFERENCE_RETURNS,
@@ -45,15 +42,6 @@ class Tables(NamedTuple):
         return (self.record.study.title if self.record.study else "") or self.name
 
 
-def _planned(record: RunsRecord, registration: Registration | None) -> Planned:
-    """What runs are compared with, and what reaches verdicts: only what was registered."""
-    rules = record.study.verdicts if record.study else Rules()
-    planned = (
-        registration.registered.planned if registration else Planned(rules.replace(primary=()))
-    )
-    return replace(planned, rules=planned.rules.replace(baseline=record.baseline))
-
-
 def check_tables(folder: Path) -> None:
     """Make sure that a folder has the tables of a study.
 
@@ -80,18 +68,12 @@ def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     """
     check_tables(folder)
     record = read_document(folder / RECORD, RunsRecord)
-    registration = read_registration(folder)
-    registered = record.registration.sha256 if record.registration else None
-    if registered and registration is None:
-        raise InputError(f"{folder / REGISTRATION} is missing: put it back, as {RECORD} names it")
-    if registered != (registration.sha256 if registration else None):
-        raise InputError(f"{folder}: {RECORD} is of another registration than {REGISTRATION}")
     sha256 = record.tables
     returns = read_rows(folder / RETURNS, Return, sha256.get(RETURNS, ""))
     references = read_references(folder, sha256.get(REFERENCE_RETURNS))
     told, known = sha256.get(RUN_INFOS), sha256.get(DIAGNOSTICS)
     infos = read_rows(folder / RUN_INFOS, RunInfo, told) if told else []
     rows = read_diagnostics(folder / DIAGNOSTICS, known) if known else []
-    statistics = found(record, returns, references, _planned(record, registration), across_trainers)
+    statistics = found(record, returns, references, across_trainers)
     name = folder.resolve().name.encode(errors="replace").decode()
     return Tables(name, record, returns, infos, references, by_label(rows), *statistics)

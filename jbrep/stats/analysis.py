@@ -1,21 +1,21 @@
 """A whole study: results of every representation, comparisons with the baseline, verdicts."""
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
 
 from jbrep.stats.aggregates import Aggregate, aggregates
 from jbrep.stats.bootstrap import Array, Interval, without_nan
-from jbrep.stats.claims import Verdict
 from jbrep.stats.comparison import Comparison, compare
 from jbrep.stats.curves import compared
 from jbrep.stats.intervals import LEVEL, mean_within
 from jbrep.stats.labels import YES, RepresentationResult, describe
-from jbrep.stats.rules import Planned
+from jbrep.stats.rules import Planned, Verdict
 from jbrep.stats.runs import Group, RunCurve, evaluated_run, groups
-from jbrep.stats.scale import SOLVED, best_blind, scale_of
+from jbrep.stats.scale import SOLVED, Ends, best_blind, scale_of
 
 References = Mapping[str, Mapping[str, Sequence[float]]]  # returns by task and policy
 
@@ -31,9 +31,8 @@ class GroupAnalysis:
     return_floor: float  # the least possible return of the task; NaN if unknown
     return_ceiling: float  # the largest possible one; NaN if unknown
     failure_return: float  # what a failed run counts as from the step of failure on
-    reference: float  # the return that gains are counted over, as in `Scale`
+    ends: Ends  # the returns that score 0 and 1
     blind: Interval  # the return that shows whether agents learned, as in `Scale`
-    reference_policy: str | None  # the policy that returns it; None if no policy's return is known
     # mean returns of policies that don't learn, each with its 95 % interval over starts
     references: Mapping[str, Interval]
     # the return to reach for each of STEPS_TO; NaN where there is none
@@ -42,6 +41,7 @@ class GroupAnalysis:
     labels: tuple[RepresentationResult, ...]  # results of each representation, the baseline first
     # of the other representations with the baseline, in the same order
     comparisons: tuple[Comparison, ...]
+    verdicts: tuple[Verdict, ...]  # on the claims that were registered
 
     @property
     def solved(self) -> float:
@@ -54,15 +54,9 @@ class GroupAnalysis:
         return best_blind({policy: mean.value for policy, mean in self.references.items()})
 
     @property
-    def is_judged(self) -> bool:
-        """Whether a comparison has verdicts."""
-        return any(comparison.is_judged for comparison in self.comparisons)
-
-    @property
-    def compared(self) -> list[Comparison]:
-        """What can be compared: all if the baseline learned, or else what is judged."""
-        learned = self.labels[0].learnt == YES
-        return [each for each in self.comparisons if learned or each.is_judged]
+    def compared(self) -> tuple[Comparison, ...]:
+        """What can be compared with the baseline: nothing if that didn't learn."""
+        return self.comparisons if self.labels[0].learnt == YES else ()
 
     @property
     def name(self) -> str:
@@ -77,7 +71,7 @@ class Analysis:
     seed: int  # of all resampling
     planned: Planned  # what reached the verdicts
     groups: tuple[GroupAnalysis, ...]  # by task and algorithm
-    aggregates: tuple[Aggregate, ...]  # results across tasks, where an algorithm learned several
+    aggregates: tuple[Aggregate, ...]  # results across tasks that have scores, of each algorithm
 
     @property
     def baseline(self) -> str:
@@ -85,25 +79,9 @@ class Analysis:
         return self.planned.rules.baseline
 
     @property
-    def open_groups(self) -> tuple[GroupAnalysis, ...]:
-        """The groups, without the numbers of comparisons that may not be looked at."""
-        return tuple(
-            replace(
-                group,
-                comparisons=tuple(
-                    each if each.is_open else replace(each, numbers={}, brown_forsythe_p=np.nan)
-                    for each in group.comparisons
-                ),
-            )
-            for group in self.groups
-        )
-
-    @property
-    def open_aggregates(self) -> list[Aggregate]:
-        """Results across tasks of the representations that may be looked at on all."""
-        every = (each for group in self.groups for each in group.comparisons)
-        closed = {each.representation for each in every if not each.is_open}
-        return [each for each in self.aggregates if each.representation not in closed]
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """On all claims that were registered."""
+        return tuple(verdict for group in self.groups for verdict in group.verdicts)
 
 
 def analyse(
@@ -116,8 +94,8 @@ def analyse(
 
     Args:
         runs: every run of the study.
-        planned: what the runs are compared with, and what reaches verdicts; by default the full
-            observation, and there are estimates of each claim alone.
+        planned: what the runs are compared with, and the claims that get verdicts; by default the
+            full observation, and none.
         seed: of all resampling.
         references: returns of policies that don't learn, by task and policy.
 
@@ -128,22 +106,26 @@ def analyse(
     by_group, played = groups(runs, planned.rules.baseline), references or {}
     verdicts = planned(by_group, seed)
     analysed = tuple(
-        _analyse_group(group, verdicts[key], played.get(key[0], {}), planned, seed)
+        _analyse_group(
+            group,
+            tuple(each for each in verdicts if (each.task, each.algorithm) == key),
+            played.get(key[0], {}),
+            seed,
+        )
         for key, group in by_group.items()
     )
     return Analysis(
         seed=seed,
         planned=planned,
         groups=analysed,
-        aggregates=tuple(aggregates(_gains(analysed), seed)),
+        aggregates=tuple(aggregates(_scores(analysed), seed)),
     )
 
 
 def _analyse_group(
     group: Group,
-    verdicts: Mapping[str, tuple[Verdict, ...]],
+    verdicts: tuple[Verdict, ...],
     references: Mapping[str, Sequence[float]],
-    planned: Planned,
     seed: int,
 ) -> GroupAnalysis:
     first, known = evaluated_run(group), compared(group)
@@ -154,8 +136,7 @@ def _analyse_group(
         policy: mean_within(np.array(returns[:starts]), first.bounds, LEVEL)
         for policy, returns in references.items()
     }
-    means = {policy: float(np.mean(returns)) for policy, returns in references.items()}
-    scale = scale_of(known, first, played)
+    scale = scale_of(known, played)
     baseline, *others = (
         describe(runs, known.curves[name], known.finals[name], scale, seed)
         for name, runs in group.items()
@@ -168,31 +149,22 @@ def _analyse_group(
         return_ceiling=_or_nan(first.return_ceiling),
         failure_return=_or_nan(first.failure_return),
         references=played,
-        reference_policy=planned.rules.reference(means),
         labels=(baseline, *others),
-        comparisons=tuple(
-            compare(
-                *(each, baseline, verdicts[each.representation]),
-                looks=len(planned.looks),
-                bounds=first.bounds,
-                seed=seed,
-            )
-            for each in others
-        ),
+        comparisons=tuple(compare(each, baseline, known, seed) for each in others),
+        verdicts=verdicts,
         **scale._asdict(),
     )
 
 
-def _gains(groups: Sequence[GroupAnalysis]) -> dict[str, dict[str, dict[str, Array]]]:
-    """What each run gains, by algorithm, task and representation, where the baseline learns."""
-    gains: dict[str, dict[str, dict[str, Array]]] = {}
+def _scores(groups: Sequence[GroupAnalysis]) -> dict[str, dict[str, dict[str, Array]]]:
+    """What each run scores, by algorithm, task and representation, where that is known."""
+    scores: dict[str, dict[str, dict[str, Array]]] = {}
     for group in groups:
-        finals = {each.representation: each.by_run["final_return"] for each in group.labels}
-        if group.labels[0].learnt == YES:
-            gains.setdefault(group.algorithm, {})[group.task] = {
-                name: each - group.reference for name, each in finals.items()
+        if not math.isnan(group.ends.top):
+            scores.setdefault(group.algorithm, {})[group.task] = {
+                each.representation: each.by_run["score"] for each in group.labels
             }
-    return gains
+    return scores
 
 
 def _or_nan(value: float | None) -> float:
@@ -203,6 +175,8 @@ def to_plain(value: Any) -> Any:
     """Results as plain JSON: an interval is [value, low, high], None stands for not finite."""
     if isinstance(value, Interval):
         return value.tolist()
+    if isinstance(value, Ends):
+        return to_plain(value._asdict())
     if is_dataclass(value):
         return {field.name: to_plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):

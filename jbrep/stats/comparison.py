@@ -1,4 +1,4 @@
-"""A representation's runs against the baseline's: numbers, and verdicts on the claims."""
+"""A representation's runs against the baseline's, in numbers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,19 +7,28 @@ import numpy as np
 from scipy.stats import levene, rankdata
 
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.claims import CONTRADICTED, EXPLORATORY, NOT_YET, SUPPORTED, Verdict
+from jbrep.stats.claims import FASTER, LESS_VARIABLE
+from jbrep.stats.curves import Compared
 from jbrep.stats.intervals import (
     FEWEST_RUNS,
     LEVEL,
+    UNDEFINED,
     Bounds,
     constant,
-    difference_within,
+    mean_within,
     percentile,
+    share_of_gain,
     unless_few,
     variance_ratio,
 )
 from jbrep.stats.labels import RepresentationResult, median
+from jbrep.stats.pairs import Pair, paired
 from jbrep.stats.scale import STEPS_TO
+
+_PAIRED = (
+    *("final_return_difference", "score_difference", "mean_return_difference"),
+    *("share_of_gain", "steps_later", "spread_ratio"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,49 +39,18 @@ class Comparison:
     # differences, ratios and the probability of improvement, by name, each with its 95 % interval
     numbers: Mapping[str, Interval]
     brown_forsythe_p: float  # of equal variances of final returns; NaN where it is undefined
-    verdicts: tuple[Verdict, ...]  # one for each claim
-    looks: int  # after which there may be verdicts
-    runs: tuple[int, int]  # of the representation and of the baseline
-
-    @property
-    def is_open(self) -> bool:
-        """Whether all runs may be looked at: no verdict is still to come on more of them."""
-        states = {verdict.verdict for verdict in self.verdicts}
-        if NOT_YET in states:
-            return False
-        is_done = CONTRADICTED in states or states <= {SUPPORTED, EXPLORATORY}
-        was_last = max(verdict.look for verdict in self.verdicts) == self.looks
-        return is_done or was_last or self.counts_all
-
-    @property
-    def counts_all(self) -> bool:
-        """Whether its verdicts count all runs."""
-        return all(verdict.runs == self.runs for verdict in self.verdicts)
-
-    @property
-    def is_judged(self) -> bool:
-        """Whether it has verdicts: it isn't exploratory."""
-        return any(verdict.verdict != EXPLORATORY for verdict in self.verdicts)
+    shared: int  # seeds of both, over which differences are taken
+    by_encoder: bool  # whether that is over encoders
 
 
 def compare(
-    label: RepresentationResult,
-    baseline: RepresentationResult,
-    verdicts: tuple[Verdict, ...],
-    looks: int,
-    bounds: Bounds,
-    seed: int,
+    label: RepresentationResult, baseline: RepresentationResult, known: Compared, seed: int
 ) -> Comparison:
-    """A representation against the baseline of the same task and algorithm, by bounded returns.
-
-    Verdicts may come after so many looks.
-    """
+    """A representation against the baseline of the same task and algorithm."""
     pairs = {name: (label.by_run[name], baseline.by_run[name]) for name in label.by_run}
     finals, runs = pairs["final_return"], (len(label.seeds), len(baseline.seeds))
-    numbers = {}
-    for name in ("final_return", "mean_return"):
-        difference = difference_within(*pairs[name], bounds, LEVEL)
-        numbers[f"{name}_difference"] = unless_few(difference, *runs)
+    found = paired(known, label.representation, baseline.representation)
+    numbers = _differences(found, seed) if found else dict.fromkeys(_PAIRED, UNDEFINED)
     numbers["variance_ratio"] = unless_few(variance_ratio(*finals), *runs)
     for name, statistic in (
         ("variance_ratio_bootstrap", _ratio_of_variances),
@@ -85,10 +63,30 @@ def compare(
         representation=label.representation,
         numbers=numbers,
         brown_forsythe_p=_brown_forsythe(*finals),
-        verdicts=verdicts,
-        looks=looks,
-        runs=runs,
+        shared=found.runs if found else 0,
+        by_encoder=found is not None and found.by_encoder,
     )
+
+
+def _differences(pair: Pair, seed: int) -> dict[str, Interval]:
+    """What is compared unit by unit; shares of gains and ratios only where the baseline learned."""
+    x, y = pair.x, pair.y
+    score = pair.ends.score(x.final) - pair.ends.score(y.final)
+    every = (
+        mean_within(x.final - y.final, Bounds(), LEVEL),
+        mean_within(score, Bounds(), LEVEL),
+        mean_within(x.mean - y.mean, Bounds(), LEVEL),
+        *(
+            (
+                share_of_gain(x.final, y.final, pair.ends.blind, LEVEL),
+                FASTER.estimate(pair, LEVEL, seed),
+                LESS_VARIABLE.estimate(pair, LEVEL, seed),
+            )
+            if pair.y_learns
+            else [UNDEFINED] * 3
+        ),
+    )
+    return {n: unless_few(e, pair.units) for n, e in zip(_PAIRED, every, strict=True)}
 
 
 def probability_of_improvement(x: Array, y: Array) -> Array:

@@ -15,6 +15,7 @@ from jbrep.stats.runs import Group, RunCurve
 
 PERCENTILES = (10, 25, 50, 75, 90)
 _LAST = 0.1  # of the grid's range, for the final return
+_FIFTH = 0.2  # of training, at whose ends it is asked whether curves still rise
 _POINTS = 64  # of the grid at a time, to keep the resamples in memory
 
 
@@ -136,7 +137,8 @@ class Compared(NamedTuple):
 
     grid: Array  # training steps, (g,)
     cut: str | None  # which evaluations it leaves out, in words; None if it leaves out none
-    # of each representation's runs on the grid, (runs, g), the baseline first
+    runs: Group  # the runs, the baseline's first
+    # of each representation's runs on the grid, (runs, g)
     curves: dict[str, Array]
     finals: dict[str, Array]  # the final return of each of these runs, (runs,)
     # whether that is the mean of the last evaluation, of its starts, or by `final_return`; of a
@@ -159,7 +161,20 @@ def compared(group: Group) -> Compared:
     curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in group.items()}
     on_all_starts = _end_on_all_starts(group, grid)
     finals = {n: _ends(runs, curves[n], grid, on_all_starts) for n, runs in group.items()}
-    return Compared(grid, cut, curves, finals, on_all_starts)
+    return Compared(grid, cut, group, curves, finals, on_all_starts)
+
+
+def rise(curves: Array, grid: Array) -> Array:
+    """How much the mean evaluation in the last fifth of training is above that of the fifth before.
+
+    Of each curve, (runs, g); NaN where there is no evaluation in one of the fifths.
+    """
+    fifth = _FIFTH * grid[-1]
+    last = grid > grid[-1] - fifth
+    before = (grid > grid[-1] - 2 * fifth) & ~last
+    if not (last.any() and before.any()):
+        return np.full(len(curves), np.nan)
+    return curves[:, last].mean(axis=1) - curves[:, before].mean(axis=1)
 
 
 def mean_return(curves: Array, grid: Array) -> Array:

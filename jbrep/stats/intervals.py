@@ -34,14 +34,25 @@ the others near 50, from runs that don't (40,000 samples each):
       of 99.44 %                         94.6  80.7  85.3    93.4  86.5  97.1
 
 because a group in which all runs happen to learn seems to vary little. That is why no verdict
-depends on a ratio of variances.
+depends on a ratio of variances, and why those on returns must hold even if as many runs failed as
+can't be excluded (`jbrep.stats.rules`).
 
-Intervals of means, and of their differences, stay within what is possible: Student's is taken on a
-scale on which the task's bounds are infinitely far away, of the logit where returns have two
-bounds, of the logarithm where they have one (the delta method). Intervals of several means are
-joined into that of their sum by Zou and Donner 2008, "Construction of confidence limits about
-effect measures", Statistics in Medicine 27, which needs no equal variances and keeps to the bounds
-as well.
+Intervals of means stay within what is possible: Student's is taken on a scale on which the task's
+bounds are infinitely far away, of the logit where returns have two bounds, of the logarithm where
+they have one (the delta method). Differences are taken within units (`jbrep.stats.pairs`), under
+Student's t. Of eight encoders with one, two or four runs each, compared with a baseline on the same
+seeds, intervals of 95 % over differences covered [%], beside what could be done instead
+(`python benchmarks/coverage.py`; 4,000 samples each):
+
+                                              encoders           runs, paired       runs, unpaired
+    runs differ                           95.2  95.1  95.2    95.2  94.8  95.3    97.1  95.9  95.5
+    seeds have 0.6 of the variance        95.2  95.1  95.2    95.2  94.8  95.3    99.7  99.8  99.8
+    encoders have 0.6 of it               95.6  95.2  95.2    95.6  91.7  84.7    96.7  92.4  85.2
+    0.4 each                              95.5  95.2  95.2    95.5  91.3  83.9    99.2  97.9  92.3
+      skewed                              95.3  94.8  95.6    95.3  90.7  84.0    99.2  97.1  93.6
+      a tenth fails                       95.2  94.8  95.5    95.2  90.0  82.4    99.0  97.2  92.3
+
+A nested bootstrap of encoders and their runs covered 87 to 98.
 """
 
 import math
@@ -50,7 +61,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import stdtrit
 from scipy.stats import norm, trim_mean
 
@@ -61,8 +71,6 @@ RESAMPLES = 2000
 UNDEFINED = Interval(np.nan, np.nan, np.nan)
 _FEWEST_FOR_RATIOS = 3  # with two runs Bonett's interval of a ratio covers 86 %
 FEWEST_RUNS = 4  # for an interval: three or fewer are better shown as points
-_LEAST_P, _MOST_P = 1e-12, 1 - 1e-6  # beyond, intervals are narrower than returns are told apart
-_FURTHEST = 1e3  # shares of a gain that are looked for
 
 
 def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) -> Interval:
@@ -198,72 +206,22 @@ def surely_above(values: Array, least: float, bounds: Bounds) -> bool:
     return bool(mean_within(values, bounds, LEVEL).low > least)
 
 
-def difference_within(
-    x: Array, y: Array, bounds: Bounds, level: float, share: float = 1
-) -> Interval:
-    """The mean of x (..., n) less a share of that of y (..., m), with its interval, (...).
+def share_of_gain(x: Array, y: Array, reference: float, level: float) -> Interval:
+    """The gain of x (n,) over a reference as a share of that of y (n,), with its interval.
 
-    What doesn't vary adds nothing to the interval, which is NaN where nothing varies.
+    Units are paired. The interval has the shares c for which Student's interval of the mean of
+    x - reference - c (y - reference) holds 0 (Fieller 1954). An end is infinite where y may not
+    gain anything; all is NaN where it doesn't.
     """
-    of_x, of_y = (_known(mean_within(each, bounds, level)) for each in (x, y))
-    least, most = (of_y.high, of_y.low) if share > 0 else (of_y.low, of_y.high)
-    value = of_x.value - share * of_y.value
-    low = value - np.sqrt((of_x.value - of_x.low) ** 2 + (share * (of_y.value - least)) ** 2)
-    high = value + np.sqrt((of_x.value - of_x.high) ** 2 + (share * (of_y.value - most)) ** 2)
-    return Interval(value, *(np.where(low < high, end, np.nan) for end in (low, high)))
-
-
-def _known(mean: Interval) -> Interval:
-    """Without width where the interval isn't known."""
-    return Interval(mean.value, *(np.where(np.isnan(e), mean.value, e) for e in mean[1:]))
-
-
-def p_of_difference(x: Array, y: Array, bounds: Bounds, boundary: float, share: float = 1) -> float:
-    """The two-sided p-value of a difference of means, of (n,) and (m,), lying on a boundary.
-
-    It is 1 minus the level of the interval that ends there; NaN where nothing varies.
-    """
-
-    def room(p: float) -> float:
-        value, low, high = difference_within(x, y, bounds, 1 - p, share)
-        return float(boundary - low if value > boundary else high - boundary)
-
-    if np.isnan(room(0.5)):
-        return np.nan
-    if room(_LEAST_P) <= 0:
-        return _LEAST_P
-    return float(brentq(room, _LEAST_P, _MOST_P)) if room(_MOST_P) < 0 else 1.0
-
-
-def share_of_gain(x: Array, y: Array, reference: float, bounds: Bounds, level: float) -> Interval:
-    """The gain of x (n,) over a reference as a share of that of y (m,), with its interval.
-
-    The interval has the shares c with which the interval of mean(x) - c mean(y) has what the
-    reference would give (Fieller 1954). An end is infinite where y may not gain anything: no share
-    is excluded in that direction, as far as they are looked for.
-    """
-    gained, of_y = x.mean() - reference, y.mean() - reference
+    gains = np.stack((x - reference, y - reference))
+    of_x, of_y = gains.mean(axis=1)
     if of_y <= 0:
         return UNDEFINED
-    value = float(gained / of_y)
-
-    def room(share: float, direction: int) -> float:
-        _, low, high = difference_within(x, y, bounds, level, share)
-        return float((low if direction < 0 else high) - (1 - share) * reference) * direction
-
-    return Interval(value, *(_end(room, value, direction) for direction in (-1, 1)))
-
-
-def _end(room: Callable[[float, int], float], value: float, direction: int) -> float:
-    """The share in a direction from which on the interval is on one side; NaN if it has no width.
-
-    It is infinite if there is no such share.
-    """
-    if np.isnan(room(value, direction)):
-        return np.nan
-    step = 0.25
-    while step < _FURTHEST:
-        if room(value + direction * step, direction) < 0:
-            return float(brentq(room, value, value + direction * step, (direction,)))
-        step *= 2
-    return direction * math.inf
+    quantile = stdtrit(len(x) - 1, (1 + level) / 2)
+    (xx, xy), (_, yy) = quantile**2 * np.cov(gains) / len(x)
+    a, b, c = of_y**2 - yy, of_x * of_y - xy, of_x**2 - xx
+    value = float(of_x / of_y)
+    if a <= 0:
+        return Interval(value, -np.inf, np.inf)
+    half = math.sqrt(max(b * b - a * c, 0.0))
+    return Interval(value, float(b - half) / a, float(b + half) / a)

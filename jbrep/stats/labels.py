@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binomtest, iqr, median_abs_deviation
 
-from jbrep.stats.arms import of_encoders
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.curves import Curve, bands, final_return, iqm, mean_return, steps_to
+from jbrep.stats.curves import Curve, bands, final_return, iqm, mean_return, rise, steps_to
 from jbrep.stats.intervals import (
     LEVEL,
     UNDEFINED,
@@ -20,20 +19,13 @@ from jbrep.stats.intervals import (
     unless_few,
 )
 from jbrep.stats.nested import components
-from jbrep.stats.reliability import TAIL_OF_RUNS, expected_shortfall, fixed_policy, within_runs
+from jbrep.stats.pairs import FEWEST_UNITS, Units, linked_units
 from jbrep.stats.runs import RunCurve
 from jbrep.stats.scale import STEPS_TO, Scale
 
 YES, NO, UNCLEAR = "yes", "no", "unclear"
 REACHED = {name: name.replace("steps_to", "reached") for name in STEPS_TO}
-WITHIN = (  # of one run
-    "dispersion_across_time",
-    "short_term_risk",
-    "long_term_risk",
-    "largest_drawdown",
-    "policy_dispersion",
-    "policy_risk",
-)
+_TAIL = 0.25  # of runs: a smaller part of so few would be the worst run alone
 # of the variance of final returns, where each of several encoders has several runs
 COMPONENTS = ("encoder_variance", "run_variance", "encoder_variance_ratio")
 
@@ -55,6 +47,11 @@ class RepresentationResult:
     # the share of runs whose final return is above each of the group's profile_returns, (k,)
     profile: Interval
 
+    @property
+    def rises(self) -> bool:
+        """Whether returns surely still rise at the end of training."""
+        return bool(self.numbers["rise"].low > 0)
+
 
 def describe(
     runs: list[RunCurve], curves: Array, final: Array, scale: Scale, seed: int
@@ -64,15 +61,15 @@ def describe(
     The curves are on the grid of the scale, (runs, g); final returns are (runs,).
     """
     grid = scale.grid
-    failed = np.array([run.failed_at is not None for run in runs])
     by_run = {
         "final_return": final,
         "mean_return": mean_return(curves, grid),
         "gain": final_return(curves, grid) - curves[:, 0],
         **{name: steps_to(curves, grid, each) for name, each in scale.thresholds.items()},
-        **within_runs(curves, failed),
-        **fixed_policy(runs, grid[-1]),
+        "score": scale.ends.score(final),
+        "rise": rise(curves, grid),
     }
+    encoders = linked_units([[run.encoder_seed for run in runs]])
     return RepresentationResult(
         representation=runs[0].representation,
         settings=runs[0].settings,
@@ -82,7 +79,10 @@ def describe(
         learnt=learnt(final, scale.blind, runs[0].bounds),
         curve=bands(curves, seed),
         by_run=by_run,
-        numbers={**_numbers(by_run, runs[0].bounds, seed), **_components(runs, final)},
+        numbers={
+            **_numbers(by_run, encoders, runs[0].bounds, seed),
+            **_components(encoders, final),
+        },
         profile=profile(by_run["final_return"], scale.profile_returns, seed),
     )
 
@@ -103,27 +103,33 @@ def profile(final_return: Array, returns: Array, seed: int) -> Interval:
     return percentile(lambda values: values.mean(axis=-1), above, seed=seed)
 
 
-def _components(runs: list[RunCurve], final: Array) -> dict[str, Interval]:
+def _components(encoders: Units, final: Array) -> dict[str, Interval]:
     """The variance of encoders and of runs, where each encoder has as many runs, at least two."""
-    units = of_encoders(runs)
-    counts = {len(unit) for unit in units}
-    known = len(units) > 1 and len(counts) == 1 and counts != {1}
-    found = components(final[units]) if known else [UNDEFINED] * 3
+    counts = {len(runs) for runs in encoders}
+    known = len(encoders) > 1 and len(counts) == 1 and counts != {1}
+    found = components(final[np.array(encoders)]) if known else [UNDEFINED] * 3
     return dict(zip(COMPONENTS, found, strict=True))
 
 
-def _mean(values: Array, bounds: Bounds) -> Interval:
-    return unless_few(mean_within(values, bounds, LEVEL), len(values))
+def _mean(values: Array, units: Units, bounds: Bounds) -> Interval:
+    """The mean over runs (n,), with its interval over units."""
+    of_units = np.array([values[unit].mean() for unit in units])
+    return unless_few(mean_within(of_units, bounds, LEVEL), len(units))
 
 
-def _numbers(by_run: Mapping[str, Array], bounds: Bounds, seed: int) -> dict[str, Interval]:
+def _numbers(
+    by_run: Mapping[str, Array], encoders: Units, bounds: Bounds, seed: int
+) -> dict[str, Interval]:
+    each_run = [[run] for run in range(len(by_run["final_return"]))]
+    units = encoders if len(encoders) >= FEWEST_UNITS else each_run
     numbers = {}
     for name in ("final_return", "mean_return"):
         values = by_run[name]
-        numbers[f"{name}_mean"] = _mean(values, bounds)
+        numbers[f"{name}_mean"] = _mean(values, units, bounds)
         numbers[f"{name}_median"] = percentile(median, values, seed=seed)
         numbers[f"{name}_iqm"] = percentile(iqm, values, seed=seed)
-    numbers["gain"] = _mean(by_run["gain"], Bounds())
+    for name in ("gain", "score", "rise"):
+        numbers[name] = _mean(by_run[name], units, Bounds())
     final = by_run["final_return"]
     numbers["final_return_sd"] = deviation(final)
     numbers["final_return_iqr"] = percentile(lambda v: iqr(v, axis=-1), final, seed=seed)
@@ -131,15 +137,27 @@ def _numbers(by_run: Mapping[str, Array], bounds: Bounds, seed: int) -> dict[str
         lambda v: median_abs_deviation(v, axis=-1), final, seed=seed
     )
     numbers["risk_across_runs"] = percentile(
-        lambda v: expected_shortfall(v, TAIL_OF_RUNS), final, seed=seed
+        lambda v: expected_shortfall(v, _TAIL), final, seed=seed
     )
     for name in STEPS_TO:
         numbers[name] = percentile(median, by_run[name], seed=seed)
         numbers[REACHED[name]] = _share_reached(by_run[name])
-    for name in WITHIN:
-        finished = by_run[name][~np.isnan(by_run[name])]
-        numbers[name] = percentile(median, finished, seed=seed) if len(finished) else UNDEFINED
     return numbers
+
+
+def expected_shortfall(values: Array, tail: float) -> Array:
+    """The mean of the lowest part of (..., n), also called CVaR.
+
+    A value on the edge of the tail counts in part (Rockafellar and Uryasev 2002,
+    "Conditional value-at-risk for general loss distributions"); a tail of less than one value is
+    the lowest.
+    """
+    ordered = np.sort(values, axis=-1)
+    mass = tail * values.shape[-1]
+    if mass <= 1:
+        return ordered[..., 0]
+    weights = np.clip(mass - np.arange(values.shape[-1]), 0, 1)
+    return ordered @ weights / mass
 
 
 def median(values: Array) -> Array:

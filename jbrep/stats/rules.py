@@ -1,57 +1,53 @@
 """Verdicts on claims, by rules that are fixed before the first run.
 
-Within a cell (a task, an algorithm and a representation) claims are tested one after the other,
-each once the one before it is supported. The cells begin with equal shares of the level; one that
-is done passes its share on to the others (Holm 1979; with orders within cells, Bretz et al. 2009,
-"A graphical approach to sequentially rejective multiple test procedures", Statistics in Medicine
-28). At each look of the study, tests take their part of that level (O'Brien and Fleming 1979, "A
-multiple testing procedure for clinical trials", Biometrics 35): at the look with a share t of all
-runs, a statistic that is standard normal if there is no effect decides beyond C / sqrt(t). The
-constant C is found by integrating over the paths that haven't decided yet, as in Armitage,
-McPherson and Rowe 1969, "Repeated significance tests on accumulating data".
+The claims on two representations of a task and algorithm are tested one after the other, each once
+the one before it is supported. Such chains begin with equal shares of the error; one that is done
+passes its share on to the others (Holm 1979; with orders within chains, Bretz et al. 2009, "A
+graphical approach to sequentially rejective multiple test procedures", Statistics in Medicine 28).
+There is one look: when all planned runs of both sides have ended.
 """
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
-from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from msgspec import Meta
-from scipy.integrate import simpson
-from scipy.optimize import brentq
-from scipy.stats import binomtest, norm
+from scipy.stats import binomtest
 
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.records.record import Record
-from jbrep.stats.arms import FEWEST_UNITS, Sides, learns, measure
+from jbrep.stats.bootstrap import Interval
 from jbrep.stats.claims import (
+    BETTER,
     CLAIMS,
     CONTRADICTED,
-    EXPLORATORY,
     NOT_WORSE,
-    NOT_YET,
     SUPPORTED,
     UNDECIDED,
     Claim,
-    Verdict,
-    Verdicts,
 )
 from jbrep.stats.intervals import LEVEL, UNDEFINED, unless_few
-from jbrep.stats.runs import Group, Key
-from jbrep.stats.scale import CONSTANT, RANDOM, STILL, best_blind
+from jbrep.stats.pairs import FEWEST_UNITS, Pair, pair_of
+from jbrep.stats.runs import LARGEST_RETURN, Group, Key
 
-_USUAL_LOOKS = (0.5, 1.0)
+_FIRST = (BETTER.name, NOT_WORSE.name)  # agents that learn nothing vary little
+_SENTENCE = re.compile(rf"(\S+) ({'|'.join(CLAIMS)})(?: than (\S+))?")
 _Share = Annotated[float, Meta(gt=0, lt=1)]
-_OVER = {  # which of them gains are counted over, by the words of a study
-    "drives": (STILL, CONSTANT, RANDOM),
-    "blind": (STILL, RANDOM),
-    "still": (STILL,),
-}
-_POINTS = 401  # of the grid on which paths are integrated, with Simpson's rule
+
+
+class Stated(NamedTuple):
+    """A claim of a study's file."""
+
+    x: str
+    claim: Claim
+    y: str
+
+    def __str__(self) -> str:
+        return f"{self.x} {self.claim.name} than {self.y}"
 
 
 class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
@@ -61,18 +57,19 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
         InputError: a field is out of its range, or they contradict one another.
     """
 
-    primary: Annotated[
-        tuple[str, ...],
-        Meta(description="The cells that get verdicts, TASK/ALGORITHM/REPRESENTATION each."),
-    ] = ()
     claims: Annotated[
-        tuple[str, ...], Meta(description="In the order in which they are tested.")
-    ] = tuple(CLAIMS)
+        tuple[str, ...],
+        Meta(
+            description=f"Such as 'symmetry better than coordinates', for each task and algorithm: "
+            f"{', '.join(CLAIMS)}; without 'than', of the baseline. Claims on the same two are "
+            "tested in their order."
+        ),
+    ] = ()
     baseline: Annotated[
         str,
         Meta(
-            description="The representation that the others are compared with; where no agent sees "
-            "it, the first."
+            description="The representation that tables compare the others with; where no agent "
+            "sees it, the first."
         ),
     ] = FULL
     error: Annotated[
@@ -80,328 +77,260 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
         Meta(description="The probability that any of the verdicts is wrong, two-sided."),
     ] = 0.05
     margin: Annotated[
-        _Share, Meta(description='The share of the gain that "not worse" may lose.')
-    ] = 0.1
-    failing: Annotated[
         _Share,
-        Meta(description="The share of runs that may fail to learn in what is supported, at most."),
-    ] = 0.2
-    looks: Annotated[
-        tuple[float, ...],
+        Meta(description="By how much of the score (0 to 1) 'not worse' may be lower."),
+    ] = 0.1
+    reference: Annotated[
+        str | Annotated[float, Meta(ge=-LARGEST_RETURN, le=LARGEST_RETURN)],
         Meta(
-            description="Shares of the seeds after which there may be verdicts, ascending to 1; by "
-            "default half of them and all, or all alone where half are too few for a verdict."
+            description="What scores 1, where the best policy that doesn't look scores 0: a "
+            "policy, as jbrep evaluate-policy takes it, or a return.",
+            extra={"default": "the hand-written policy"},
         ),
-    ] = ()
-    gains_over: Annotated[
-        Literal["drives", "blind", "still"],
-        Meta(
-            description="What gains are counted over: the best of standing still, a constant drive "
-            "and random actions (drives), the best of these without the constant drive (blind), or "
-            "standing still."
-        ),
-    ] = "drives"
+    ] = ""
 
     def check(self) -> None:
         """Check what no field can say alone."""
-        if len({*self.primary}) < len(self.primary):
-            raise InputError(f"primary is {list(self.primary)}: each cell may be there once")
-        looks = (0.0, *self.looks)
-        if looks[-1] not in (0, 1) or not all(a < b for a, b in pairwise(looks)):
-            raise InputError(
-                f"looks are {list(self.looks)}: they must be shares of the seeds that ascend to 1"
-            )
-        if unknown := [name for name in self.claims if name not in CLAIMS]:
-            raise InputError(f"unknown claim {unknown[0]!r}: choose of {', '.join(CLAIMS)}")
-        if self.claims[:1] != (NOT_WORSE.name,) or len({*self.claims}) < len(self.claims):
-            raise InputError(
-                f"claims are {list(self.claims)}: each may be there once, and {NOT_WORSE.name!r} "
-                "comes first, as agents that learn nothing vary little"
-            )
+        for (x, y), chain in self.chains.items():
+            names = [claim.name for claim in chain]
+            if len({*names}) < len(names):
+                raise InputError(f"claims has {names[-1]!r} of {x} than {y} twice")
+            if names[0] not in _FIRST:
+                raise InputError(
+                    f"claims has {x} {names[0]} than {y} first: {' or '.join(map(repr, _FIRST))} "
+                    f"of these two must come before, as agents that learn nothing vary little"
+                )
 
     @property
-    def share(self) -> float:
-        """The level of a cell before any is decided."""
-        return self.error / max(1, len(self.primary))
+    def stated(self) -> list[Stated]:
+        """The claims.
+
+        Raises:
+            InputError: one isn't such a sentence.
+        """
+        return [self._read(each) for each in self.claims]
+
+    def _read(self, text: str) -> Stated:
+        found = _SENTENCE.fullmatch(" ".join(text.split()))
+        if found is None or found[1] == (found[3] or self.baseline):
+            raise InputError(
+                f"claims has {text!r}: it must be as 'symmetry better than coordinates', with one "
+                f"of {', '.join(CLAIMS)} between two representations"
+            )
+        return Stated(found[1], CLAIMS[found[2]], found[3] or self.baseline)
+
+    @property
+    def chains(self) -> dict[tuple[str, str], list[Claim]]:
+        """The claims on each two representations, in the order of their tests."""
+        found: dict[tuple[str, str], list[Claim]] = {}
+        for x, claim, y in self.stated:
+            found.setdefault((x, y), []).append(claim)
+        return found
 
     @property
     def compared_with(self) -> str:
         """What the agents that others are compared with see, in words."""
         return "the full state" if self.baseline == FULL else self.baseline
 
-    @property
-    def nothing_learnt(self) -> str:
-        """Why there is no verdict where these agents don't learn."""
-        return f"agents on {self.compared_with} didn't clearly learn"
-
     def baseline_of(self, names: Iterable[str]) -> str:
         """The representation that others are compared with, of some in the order of tables."""
         every = [*names]
         return self.baseline if self.baseline in every else every[0]
 
-    @property
-    def counted_over(self) -> tuple[str, ...]:
-        """The policies over the best of which gains are counted."""
-        return _OVER[self.gains_over]
 
-    def reference(self, returns: Mapping[str, float]) -> str | None:
-        """The policy that gains are counted over, of those whose returns are known."""
-        known = {name: value for name, value in returns.items() if name in self.counted_over}
-        return best_blind(known)
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What is found of a claim."""
+
+    task: str
+    algorithm: str
+    x: str
+    claim: str
+    y: str
+    verdict: str  # SUPPORTED, CONTRADICTED or UNDECIDED
+    estimate: Interval = UNDEFINED  # with its 95 % interval; without one of three units or fewer
+    boundary: float = np.nan  # that the estimate is held against
+    p: float = np.nan  # two-sided, of lying on the boundary
+    level: float = np.nan  # of the test, two-sided
+    interval: Interval = UNDEFINED  # of 1 minus that level
+    width: float = np.nan  # of the scale from 0 to 1, where the estimate is a difference of returns
+    runs: int = 0  # on each side
+    units: int = 0  # of the test
+    by_encoder: bool = False  # whether these are encoders
+    by: int | None = None  # the steps by which it is so, where a curve of either side still rises
+    reason: str | None = None  # why it is not decided, if not because the estimate is too rough
+
+    @property
+    def sentence(self) -> str:
+        """The claim."""
+        return f"{self.x} {self.claim} than {self.y}"
 
 
 @dataclass(frozen=True)
 class Planned:
-    """Verdicts by rules on the runs that were planned; others are exploratory."""
+    """Verdicts by rules on the runs that were planned."""
 
     rules: Rules = field(default_factory=Rules)  # of the study
-    seeds: tuple[int, ...] = ()  # of the planned runs, in their order
+    seeds: tuple[int, ...] = ()  # of the planned runs; others are exploratory
+    groups: tuple[Key, ...] = ()  # of the planned runs
     # why there can be no verdict on some tasks, by name
     prevented: Mapping[str, str] = field(default_factory=dict)
 
-    @cached_property
-    def looks(self) -> tuple[float, ...]:
-        """Shares of the seeds after which there may be verdicts."""
-        if self.rules.looks:
-            return self.rules.looks
-        half = _USUAL_LOOKS[0] * len(self.seeds)
-        return _USUAL_LOOKS if half >= FEWEST_UNITS else (1.0,)
+    @property
+    def share(self) -> float:
+        """The level at which each chain of claims begins."""
+        return self.rules.error / max(1, len(self.rules.chains) * len(self.groups))
 
-    @cached_property
-    def counts(self) -> tuple[int, ...]:
-        """How many seeds there are at each look."""
-        return tuple(map(self._count, self.looks))
-
-    @cached_property
-    def shares(self) -> tuple[float, ...]:
-        """What the counts are of all seeds."""
-        return tuple(count / len(self.seeds) for count in self.counts)
-
-    def _count(self, share: float) -> int:
-        return math.ceil(share * len(self.seeds) - 1e-9)
-
-    def __call__(self, groups: Mapping[Key, Group], seed: int = 0) -> Verdicts:
-        """What is found of each claim, for each representation but the first of each group.
+    def __call__(self, groups: Mapping[Key, Group], seed: int = 0) -> list[Verdict]:
+        """What is found of each claim, on each planned task and algorithm.
 
         Raises:
             InputError: runs of a group have no range of steps in common.
         """
-        cells = {name: _Cell(name, self.rules.share) for name in self.rules.primary}
-        for look in range(len(self.looks)):
-            _look(list(cells.values()), groups, self, look, seed)
-        return {
-            key: {
-                name: _whole(cells.get(_cell_name(key, name)), group, name, self, seed)
-                for name in list(group)[1:]
-            }
-            for key, group in groups.items()
-        }
+        chains = [
+            _Chain(key, x, y, claims, self._pair(key, groups.get(key, {}), x, y), self.share)
+            for key in self.groups
+            for (x, y), claims in self.rules.chains.items()
+        ]
+        waiting = chains
+        while waiting:
+            decided = [chain for chain in waiting if chain.test(self.rules, seed)]
+            waiting = [chain for chain in chains if not chain.is_done] if decided else []
+            for chain in decided:
+                if chain.is_done:
+                    for other in waiting:
+                        other.level += chain.level / len(waiting)
+        return [verdict for chain in chains for verdict in chain.every(self.rules, seed)]
+
+    def _pair(self, key: Key, group: Group, x: str, y: str) -> Pair | str:
+        """What is compared, or why it can't be yet."""
+        if reason := self.prevented.get(key[0]):
+            return reason
+        for name in (x, y):
+            ended = {run.seed for run in group.get(name, ())}.intersection(self.seeds)
+            if len(ended) < len(self.seeds):
+                return f"{len(ended)} of {len(self.seeds)} runs on {name} have ended"
+        return pair_of(group, x, y, self.seeds) or "two runs on each side are needed"
 
 
 @dataclass
-class _Cell:
-    """A primary cell while it is tested, whether or not it has runs."""
+class _Chain:
+    """Claims on the same two representations while they are tested."""
 
-    name: str
-    level: float  # its share
-    verdicts: list[Verdict] = field(default_factory=list)  # of claims that are decided
+    key: Key
+    x: str
+    y: str
+    claims: Sequence[Claim]
+    pair: Pair | str  # a reason where there is none
+    level: float
+    decided: list[Verdict] = field(default_factory=list)
     undecided: Verdict | None = None  # of the claim that was tested last
-    is_open: bool = True
+
+    @property
+    def is_done(self) -> bool:
+        """Whether nothing is left to test."""
+        contradicted = any(each.verdict == CONTRADICTED for each in self.decided)
+        return contradicted or len(self.decided) == len(self.claims)
+
+    def test(self, rules: Rules, seed: int) -> bool:
+        """Test the claims that are left, one after the other; whether any was decided."""
+        before = len(self.decided)
+        while not (self.is_done or isinstance(self.pair, str)):
+            claim = self.claims[len(self.decided)]
+            verdict = _tested(self._estimated(claim, self.pair, rules, seed), claim, self, seed)
+            self.undecided = verdict if verdict.verdict == UNDECIDED else None
+            if self.undecided:
+                break
+            self.decided.append(verdict)
+        return len(self.decided) > before
+
+    def every(self, rules: Rules, seed: int) -> Iterator[Verdict]:
+        """A verdict on each claim: decided, tested last, or not tested."""
+        yield from self.decided
+        if self.undecided:
+            yield self.undecided
+        last = self.undecided or (self.decided[-1] if self.decided else None)
+        for claim in self.claims[len(self.decided) + bool(self.undecided) :]:
+            if isinstance(self.pair, str):
+                yield Verdict(**self._told(claim), reason=self.pair)
+            else:
+                assert last
+                reason = f"not tested: {last.claim!r} is {last.verdict}"
+                yield replace(self._estimated(claim, self.pair, rules, seed), reason=reason)
+
+    def _told(self, claim: Claim) -> dict[str, Any]:
+        task, algorithm = self.key
+        of = {"task": task, "algorithm": algorithm, "x": self.x, "claim": claim.name, "y": self.y}
+        return {**of, "verdict": UNDECIDED}
+
+    def _estimated(self, claim: Claim, pair: Pair, rules: Rules, seed: int) -> Verdict:
+        """An estimate, undecided; with a reason where there is none."""
+        learnt = pair.y_learns or not claim.takes_learning
+        boundary = claim.boundary(pair, rules.margin)
+        reason = None if learnt else f"agents on {self.y} aren't above the blind baselines"
+        if math.isnan(boundary):
+            reason = "no reference policy is known that would score 1"
+        estimate = UNDEFINED if reason else claim.estimate(pair, LEVEL, seed)
+        estimate = unless_few(estimate, pair.units)
+        return Verdict(
+            **self._told(claim),
+            estimate=estimate,
+            boundary=boundary,
+            interval=UNDEFINED._replace(value=estimate.value),
+            width=pair.ends.top - pair.ends.blind if claim.is_of_returns else np.nan,
+            runs=pair.runs,
+            units=pair.units,
+            by_encoder=pair.by_encoder,
+            by=round(pair.steps) if pair.rising else None,
+            reason=reason,
+        )
 
 
-def _cell_name(key: Key, representation: str) -> str:
-    return "/".join((*key, representation))
-
-
-def _look(
-    cells: Sequence[_Cell], groups: Mapping[Key, Group], planned: Planned, look: int, seed: int
-) -> None:
-    """Test at a look whatever can be tested; levels that become free are used at once."""
-    rules, seeds = planned.rules, planned.seeds[: planned.counts[look]]
-    ready = {
-        _cell_name(key, name): _sides(group, name, seeds)
-        for key, group in groups.items()
-        for name in list(group)[1:]
-        if key[0] not in planned.prevented and _has_all(group, name, seeds)
-    }
-    tested = True
-    while tested:
-        tested = False
-        for cell in cells:
-            if not cell.is_open or cell.name not in ready:
-                continue
-            claim = CLAIMS[rules.claims[len(cell.verdicts)]]
-            level = levels(planned.shares, cell.level)[look]
-            verdict = _tested(claim, ready[cell.name], planned, level, look + 1, seed)
-            if verdict.verdict == UNDECIDED:
-                cell.undecided = verdict
-                continue
-            cell.verdicts.append(verdict)
-            cell.undecided, tested = None, True
-            if verdict.verdict == CONTRADICTED or len(cell.verdicts) == len(rules.claims):
-                cell.is_open = False
-                _pass_on(cell, cells)
-
-
-def _pass_on(done: _Cell, cells: Sequence[_Cell]) -> None:
-    others = [cell for cell in cells if cell.is_open]
-    for cell in others:
-        cell.level += done.level / len(others)
-
-
-def _has_all(group: Group, name: str, seeds: Sequence[int]) -> bool:
-    """Whether a representation and the baseline have all runs of the seeds."""
-    both = (group[name], next(iter(group.values())))
-    return bool(seeds) and all({run.seed for run in runs}.issuperset(seeds) for runs in both)
-
-
-def _sides(group: Group, name: str, seeds: Collection[int]) -> Sides:
-    """A representation against the baseline, with the runs of some seeds."""
-    baseline = next(iter(group))
-    frame, arms = measure({each: group[each] for each in (baseline, name)}, seeds)
-    return Sides(arms[name], arms[baseline], frame)
-
-
-def _tested(
-    claim: Claim, sides: Sides, planned: Planned, level: float, look: int, seed: int
-) -> Verdict:
-    estimated = _estimated(claim, sides, planned.rules, seed)
-    if estimated.reason:  # a share of no gain is no number to judge
-        return replace(estimated, verdict=UNDECIDED, level=level, look=look)
-    boundary = estimated.boundary
-    p = claim.p_value(sides, boundary, seed)
-    direction = claim.side * np.sign(estimated.estimate.value - boundary) if p <= level else 0
-    reason = _reason(claim, sides, planned.rules, direction, level)
-    if reason is None and np.isnan(p):
-        reason = "nothing varies from run to run"
-    if (reason or not direction) and look < len(planned.counts):
-        later = f"another look comes at {planned.counts[look]} runs"
-        reason = f"{reason}; {later}" if reason else later
+def _tested(estimated: Verdict, claim: Claim, chain: _Chain, seed: int) -> Verdict:
+    pair = chain.pair
+    assert isinstance(pair, Pair)
+    if estimated.reason:
+        return estimated
+    boundary, level = estimated.boundary, chain.level
+    p = claim.p_value(pair, boundary, seed)
+    direction = int(claim.side * np.sign(estimated.estimate.value - boundary)) if p <= level else 0
+    reason = "nothing varies from run to run" if np.isnan(p) else None
+    if pair.units < FEWEST_UNITS:
+        what = "encoders" if pair.by_encoder else "runs"
+        reason = f"{pair.units} {what}; verdicts take {FEWEST_UNITS}"
+    elif direction and claim.is_of_returns:
+        reason = _may_fail(pair, estimated.estimate.value - boundary, level)
     return replace(
         estimated,
-        verdict={1: SUPPORTED, -1: CONTRADICTED, 0: UNDECIDED}[0 if reason else int(direction)],
+        verdict={1: SUPPORTED, -1: CONTRADICTED, 0: UNDECIDED}[0 if reason else direction],
         p=p,
         level=level,
-        interval=claim.tested(sides, 1 - level, seed),
-        look=look,
+        interval=claim.tested(pair, 1 - level, seed),
         reason=reason,
     )
 
 
-def _reason(claim: Claim, sides: Sides, rules: Rules, direction: int, level: float) -> str | None:
-    """Why there can't be a verdict; None if there can."""
-    x, y, _ = sides
-    fewest, what = min(x.units, y.units), "encoders" if x.by_encoder else "runs"
-    if fewest < FEWEST_UNITS:
-        return f"{fewest} {what}; verdicts take {FEWEST_UNITS}"
-    if claim.limits_failures and direction > 0:
-        most = most_failing(x.units - x.learnt, x.units, level)
-        if most > rules.failing:
-            return (
-                f"up to {100 * most:.0f} % of its {what} may fail to learn; the limit is "
-                f"{100 * rules.failing:.0f} %"
-            )
-    return None
+def _may_fail(pair: Pair, excess: float, level: float) -> str | None:
+    """Why a verdict wouldn't hold if as many units failed as can't be excluded; None if it would.
+
+    Of eight units that all learn a third may fail, unseen, which no interval shows. So the side
+    that ends higher than the boundary says has to stay so when that share of it returns no more
+    than the best policy that doesn't look.
+    """
+    side = pair.x if excess > 0 else pair.y
+    failing, units = side.failing, len(side.final)
+    more = most_failing(failing, units, level) - failing / units
+    lost = more * max(float(np.median(side.final)) - pair.ends.blind, 0.0)
+    if abs(excess) > lost:
+        return None
+    which = "it" if excess > 0 else "the other"
+    return f"up to {100 * (more + failing / units):.0f} % of runs on {which} may fail, unseen"
 
 
-def most_failing(failing: int, runs: int, level: float) -> float:
-    """The exact upper bound on the share of runs that fail (Clopper and Pearson 1934).
+def most_failing(failing: int, units: int, level: float) -> float:
+    """The exact upper bound on the share of units that fail (Clopper and Pearson 1934).
 
     The level is that of the test that rests on it, so that they err together no more often.
     """
-    test = binomtest(failing, runs, alternative="less")
+    test = binomtest(failing, units, alternative="less")
     return float(test.proportion_ci(1 - level, method="exact").high)
-
-
-def _estimated(claim: Claim, sides: Sides, rules: Rules, seed: int) -> Verdict:
-    """An estimate without a verdict."""
-    x, y, frame = sides
-    compares = learns(y, frame)
-    estimate = claim.estimate(sides, LEVEL, seed) if compares else UNDEFINED
-    estimate = unless_few(estimate, x.units, y.units)
-    return Verdict(
-        claim=claim.name,
-        verdict=EXPLORATORY,
-        estimate=estimate,
-        boundary=claim.boundary(rules.margin),
-        p=np.nan,
-        level=np.nan,
-        interval=UNDEFINED._replace(value=estimate.value),
-        runs=(x.runs, y.runs),
-        encoders=x.units if x.by_encoder else 0,
-        look=0,
-        reason=None if compares else rules.nothing_learnt,
-    )
-
-
-def _explored(
-    group: Group, name: str, rules: Rules, seeds: Collection[int], seed: int, tested: int = 0
-) -> tuple[Verdict, ...]:
-    """Estimates from runs of some seeds, of each claim but the first, which are tested."""
-    sides = _sides(group, name, seeds)
-    return tuple(_estimated(CLAIMS[each], sides, rules, seed) for each in rules.claims[tested:])
-
-
-def _whole(
-    cell: _Cell | None, group: Group, name: str, planned: Planned, seed: int
-) -> tuple[Verdict, ...]:
-    """A verdict on each claim: decided, tested last, or not tested; estimates of other cells."""
-    rules, every = planned.rules, {run.seed for runs in group.values() for run in runs}
-    if cell is None:
-        return _explored(group, name, rules, every, seed)
-    tested = (*cell.verdicts, *([cell.undecided] if cell.undecided else []))
-    if not tested:
-        first_look = f"the first look is at {planned.counts[0]} runs of each arm"
-        task = next(iter(group.values()))[0].task
-        reason = planned.prevented.get(task, first_look)
-        return tuple(
-            replace(each, verdict=NOT_YET, estimate=UNDEFINED, interval=UNDEFINED, reason=reason)
-            for each in _explored(group, name, rules, every, seed)
-        )
-    before = tested[-1]
-    seeds = planned.seeds[: planned.counts[before.look - 1]]
-    reason = f"not tested: {before.claim!r} is {before.verdict}"
-    return (
-        *tested,
-        *(
-            replace(each, verdict=UNDECIDED, look=before.look, reason=reason)
-            for each in _explored(group, name, rules, seeds, seed, len(tested))
-        ),
-    )
-
-
-@lru_cache(256)
-def levels(shares: Sequence[float], level: float) -> tuple[float, ...]:
-    """The two-sided level of the test at each look, from shares of the runs that ascend to 1.
-
-    All looks together have the level that is given, two-sided, too.
-
-    Raises:
-        InputError: looks that are too close to each other, or to the first run.
-    """
-    if len(shares) == 1:
-        return (level,)
-    least = norm.isf(level / 2)
-    try:
-        constant = brentq(lambda c: _decided(shares, c) - level, least - 0.1, 2 * least + 2)
-    except ValueError:
-        told = ", ".join(f"{share:g}" for share in shares)
-        raise InputError(
-            f"no levels can be computed for looks at {told} of the runs and an error of {level:g}: "
-            "plan fewer looks, further apart, or an error near 0.05"
-        ) from None
-    return tuple(2 * norm.sf(constant / np.sqrt(shares)).astype(float))
-
-
-def _decided(shares: Sequence[float], constant: float) -> float:
-    """The probability that one of the looks decides if there is no effect."""
-    score, weight, before, undecided = np.zeros(1), np.ones(1), 0.0, 1.0
-    every = np.eye(_POINTS)  # of which the integrals are the weights of the points
-    for share in shares:  # a score with variance t, which decides beyond C
-        spread = np.sqrt(share - before)
-        grid = np.linspace(-constant, constant, _POINTS)
-        density = norm.pdf(grid[:, None], score, spread) @ weight
-        stays = norm.cdf(constant, score, spread) - norm.cdf(-constant, score, spread)
-        undecided = float(weight @ stays)
-        score, weight, before = grid, density * simpson(every, dx=grid[1] - grid[0], axis=0), share
-    return 1 - undecided

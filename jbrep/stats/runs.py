@@ -16,8 +16,9 @@ from jbrep.stats.intervals import Bounds
 
 LARGEST_RETURN = 1e15  # of either sign: beyond, a number has diverged
 _ROUNDING = 1e-6  # of returns, relative to the largest
-_OF_TASK = ("return_floor", "return_ceiling", "reference", "solved")  # alike for all of its runs
-_NUMBERS = (*_OF_TASK, "reference_in_training", "failure_return")
+# alike for all runs of a task
+_OF_TASK = ("return_floor", "return_ceiling", "reference", "top", "solved")
+_NUMBERS = (*_OF_TASK, "reference_in_training", "top_in_training", "failure_return")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,9 @@ class RunCurve:
         reference: the return that gains are counted over, on the starts of evaluation: that of the
             best policy that doesn't look; None if unknown.
         reference_in_training: the same on the starts of `returns`; None if that is `reference`.
+        top: the return that scores 1, where `reference` scores 0: that of a policy that can do the
+            task, on the starts of evaluation; None if unknown.
+        top_in_training: the same on the starts of `returns`; None if that is `top`.
         solved: the return from which on the task counts as solved; None if unknown.
         trainer: what trained it, and how exactly; equal for all runs that are compared.
         environment: what decides which returns there can be; equal likewise.
@@ -67,6 +71,8 @@ class RunCurve:
     return_ceiling: float | None = None
     reference: float | None = None
     reference_in_training: float | None = None
+    top: float | None = None
+    top_in_training: float | None = None
     solved: float | None = None
     trainer: str = ""
     environment: str = ""

@@ -9,22 +9,36 @@ import numpy as np
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.curves import Compared, final_return
 from jbrep.stats.intervals import UNDEFINED, surely_above
-from jbrep.stats.runs import RunCurve
+from jbrep.stats.runs import RunCurve, evaluated_run
 
 SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the gain of the baseline's median run
 SOLVED = "steps_to_solved"
 STILL, CONSTANT, RANDOM = "standing still", "constant drive", "random"  # policies that don't look
-LOOKING = "hand-written"  # nor does this one learn
+BLIND = (STILL, CONSTANT, RANDOM)
+LOOKING = "hand-written"  # a policy that does
 STEPS_TO = (*(f"steps_to_{name}" for name in SHARES), SOLVED)
 _POINTS = 50  # of a performance profile, about, or half as many: round numbers
 _FAR = 1_000  # times the range of returns, beyond which a floor is no place to begin
+
+
+class Ends(NamedTuple):
+    """The returns that score 0 and 1."""
+
+    blind: float  # of the best policy that doesn't look, over which gains are counted
+    blind_in_training: float  # the same on the starts of the evaluations during training
+    top: float  # of a policy that can do the task; NaN if none is known
+
+    def score(self, returns: Array) -> Array:
+        """Returns, or NaN where they have no score."""
+        width = self.top - self.blind
+        return (returns - self.blind) / (width if width > 0 else np.nan)
 
 
 class Scale(NamedTuple):
     """What all representations of a task and algorithm are measured by."""
 
     grid: Array  # training steps at which runs are compared, (g,)
-    reference: float  # the final return that gains are counted over, by `references`
+    ends: Ends  # the returns that score 0 and 1
     blind: Interval  # the mean return of the best policy that doesn't look, by `_blind`
     # the return to reach for each of STEPS_TO, NaN where there is none
     thresholds: Mapping[str, float]
@@ -35,42 +49,50 @@ class Scale(NamedTuple):
 
 def best_blind(returns: Mapping[str, float]) -> str | None:
     """The best of policies that don't look at anything, by mean return; None if there is none."""
-    blind = [policy for policy in returns if policy != LOOKING]
+    blind = [policy for policy in BLIND if policy in returns]
     return max(blind, key=returns.__getitem__) if blind else None
 
 
-def references(compared: Compared, run: RunCurve) -> tuple[float, float]:
-    """The returns that gains are counted over: those of final returns, and those of curves.
+def ends_of(compared: Compared) -> Ends:
+    """The ends of the scale of a group, each from the same starts as what is held against it.
 
-    Either is from the same starts as what is held against it; those of the evaluations during
-    training may be fewer than those of the last. It is the run's own reference where it is known,
-    else the least possible return of the task. Where neither is known, it is that of untrained
-    policies: the mean of the baseline's curves at their first step.
+    The starts of the evaluations during training may be fewer than those of the last. Gains are
+    over the run's own reference where it is known, else over the least possible return of the task.
+    Where neither is known, it is that of untrained policies: the mean of the baseline's curves at
+    their first step.
     """
+    run = evaluated_run(compared.runs)
     known = (each for each in (run.reference, run.return_floor) if each is not None)
     last = float(next(known, compared.of_baseline[:, 0].mean()))
     training = last if run.reference_in_training is None else run.reference_in_training
-    return last if compared.on_all_starts else training, training
+    top = run.top
+    if not compared.on_all_starts and run.top_in_training is not None:
+        top = run.top_in_training
+    return Ends(
+        blind=last if compared.on_all_starts else training,
+        blind_in_training=training,
+        top=np.nan if top is None else top,
+    )
 
 
-def scale_of(compared: Compared, run: RunCurve, policies: Mapping[str, Interval]) -> Scale:
+def scale_of(compared: Compared, policies: Mapping[str, Interval]) -> Scale:
     """The scale of a group of runs.
 
     Args:
         compared: the runs.
-        run: any of the group.
         policies: mean returns of policies that don't learn, with their intervals, on the starts of
             the final returns.
     """
     grid, curves, finals = compared.grid, compared.of_baseline, [*compared.finals.values()]
-    reference, over = references(compared, run)
-    gained = surely_above(finals[0], reference, run.bounds)
-    gain = float(np.median(final_return(curves, grid))) - over
+    run, ends = evaluated_run(compared.runs), ends_of(compared)
+    gained = surely_above(finals[0], ends.blind, run.bounds)
+    gain = float(np.median(final_return(curves, grid))) - ends.blind_in_training
+    over = ends.blind_in_training
     shares = [over + share * gain if gained and gain > 0 else np.nan for share in SHARES.values()]
     thresholds = (*shares, np.nan if run.solved is None else float(run.solved))
     return Scale(
         grid=grid,
-        reference=reference,
+        ends=ends,
         blind=_blind(compared, run, policies),
         thresholds=dict(zip(STEPS_TO, thresholds, strict=True)),
         profile_returns=_round_numbers(np.concatenate(finals), run.return_floor),

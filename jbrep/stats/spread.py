@@ -23,10 +23,10 @@ _AT_ONCE = 1 << 22  # numbers in memory
 
 
 class Curves(NamedTuple):
-    """What two groups of runs are compared by."""
+    """What two representations are compared by, unit by unit."""
 
     x: Array  # curves of one, (n, g)
-    y: Array  # curves of the other, (m, g)
+    y: Array  # curves of the other, (n, g)
     weights: Array  # of the g evaluations in a mean over training, with a sum of 1
     resolution: float  # in units of return, above 0
 
@@ -76,7 +76,7 @@ def _ratio(log_ratio: float) -> float:
 
 
 def spread_p(curves: Curves, seed: int, permutations: int = PERMUTATIONS) -> float:
-    """P-value of equal spreads: whole curves are permuted after taking off their group's median.
+    """P-value of equal spreads: curves of a unit swap sides, after taking off their side's median.
 
     Two-sided, twice the smaller share, as that of few curves isn't symmetrical (Phipson and Smyth
     2010: the curves as they are count as one permutation).
@@ -98,9 +98,10 @@ def _excess(curves: Curves, log_ratio: float) -> float:
 
 
 def _permuted(curves: Curves, count: int, seed: int) -> NDArray[np.int64]:
-    """Orders of all curves, (count, n + m)."""
-    total = len(curves.x) + len(curves.y)
-    return np.random.default_rng(seed).random((count, total)).argsort(axis=1)
+    """Orders of all curves, (count, 2 n), in which units may have swapped sides."""
+    runs, every = len(curves.x), np.arange(2 * len(curves.x))
+    swapped = np.tile(np.random.default_rng(seed).random((count, runs)) < 0.5, 2)
+    return np.where(swapped, (every + runs) % (2 * runs), every)
 
 
 def _p(curves: Curves, log_ratio: float, drawn: NDArray[np.int64]) -> float:

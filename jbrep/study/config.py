@@ -8,24 +8,29 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from msgspec import UNSET, Meta, UnsetType
+from msgspec.structs import force_setattr
 
+from jbrep.collect.policies import Uniform
+from jbrep.dataset.manifest import MANIFEST
 from jbrep.dataset.settings import MAX_ROOT_SEED
 from jbrep.encoders.shipped import UNLEARNED
 from jbrep.envs.domain import Domain, read_ranges
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES
 from jbrep.errors import InputError
+from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.records.document import Document
-from jbrep.records.record import Record, from_plain, to_plain
+from jbrep.records.record import Record, converted, from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.records.toml import read_toml, toml_text
 from jbrep.rl.learner import Learner
 from jbrep.rl.presets import learns_from
 from jbrep.rl.run import trainer_of
 from jbrep.rl.settings import MAX_STEPS, Seed, TrainingSettings
-from jbrep.stats.arms import FEWEST_UNITS
-from jbrep.stats.power import Arms, obstacle
-from jbrep.stats.rules import Planned, Rules
+from jbrep.stats.claims import NOT_WORSE
+from jbrep.stats.pairs import FEWEST_UNITS, linked_units
+from jbrep.stats.power import obstacle
+from jbrep.stats.rules import Planned, Rules, Stated
 from jbrep.study.representations import (
     MAX_ENCODERS,
     ByName,
@@ -36,25 +41,40 @@ from jbrep.study.representations import (
 from jbrep.text import slug
 
 _MOST_SEEDS = (1 << 16) - 1
+UNIFORM = Uniform.kind
+_DataName = Annotated[
+    str,
+    Meta(
+        pattern=r"\A(?=.*[^.])[A-Za-z0-9_.-]{1,100}\Z",
+        title="a name of letters, digits, dots, hyphens and underscores",
+    ),
+]
 
 
 class Data(Record, frozen=True, kw_only=True):
-    """The data set that encoders are trained on: collected for the study, or an existing one."""
+    """Data that encoders are made from: collected for the study, or an existing data set."""
 
     steps: Annotated[
         int, Meta(ge=0, le=MAX_STEPS, description="Of states to collect for the encoders.")
     ] = 0
+    policy: Annotated[
+        str,
+        Meta(
+            min_length=1,
+            description="That acts, as jbrep collect takes it: uniform, heuristic, trained, a "
+            "run's folder, or a mixture.",
+        ),
+    ] = UNIFORM
     seed: Annotated[
         int, Meta(ge=0, le=MAX_ROOT_SEED - MAX_ENCODERS, description="Of the first data set.")
     ] = 0
     sets: Annotated[
-        int,
+        Annotated[int, Meta(ge=1, le=MAX_ENCODERS)] | None,
         Meta(
-            ge=1,
-            le=MAX_ENCODERS,
             description="Data sets of that size, of the seeds that follow.",
+            extra={"default": "one for each encoder of a representation"},
         ),
-    ] = 1
+    ] = None
     folder: Annotated[
         str,
         Meta(
@@ -67,8 +87,21 @@ class Data(Record, frozen=True, kw_only=True):
         """As for `Record`."""
         if bool(self.steps) == bool(self.folder):
             raise InputError("it must have either steps, to collect, or the folder of a data set")
-        if self.folder and self.sets != 1:
+        if self.folder and self.sets not in (None, 1):
             raise InputError(f"sets is {self.sets}: it is left out where there is a folder")
+        if self.folder and self.policy != UNIFORM:
+            raise InputError(f"policy is {self.policy}: it is left out where there is a folder")
+
+    def existing(self, task: str) -> Path:
+        """The folder of an existing data set: the given one, or the task's within it."""
+        folder = Path(self.folder)
+        return folder if exists(folder / MANIFEST) else folder / slug(task)
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """What a file says of it."""
+        usual = {"", 0, None, UNIFORM}
+        return {name: value for name, value in to_plain(self).items() if value not in usual}
 
 
 class Study(TrainingSettings, Document, frozen=True, kw_only=True):
@@ -128,7 +161,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             description='What each episode of all runs draws, such as delay = "0..2".',
         ),
     ] = UNSET
-    data: Data | None = None  # None: the shipped encoders
+    data: Annotated[Mapping[str, Any] | None, Meta(title="a table")] = None  # see `named_data`
     training: Annotated[
         Mapping[str, Any],
         Meta(
@@ -152,6 +185,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     def check(self) -> None:
         """As for `Record`."""
         super().check()
+        force_setattr(self, "data", _read_data(self.data))
         for name in ("tasks", "algorithms", "representations", "seeds"):
             values = list(getattr(self, name))
             if name == "representations":
@@ -175,25 +209,63 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         own = self.learners.get(name)
         return _learner(name, own) if own else Learner.of(name)
 
+    @property
+    def named_data(self) -> Mapping[str, Data]:
+        """Its data by name; that of the only one is often empty."""
+        return self.data or {}
+
+    def data_of(self, representation: ByName) -> str:
+        """The name of the data that a representation is made from.
+
+        Raises:
+            InputError: there is none of that name, or it names none of several.
+        """
+        if representation.data is None and (
+            len(self.named_data) == 1 or representation.kind in UNLEARNED
+        ):
+            return next(iter(self.named_data))
+        if representation.data and representation.data in self.named_data:
+            return representation.data
+        names = ", ".join(filter(None, self.named_data))
+        expected = f"must be one of {names}" if names else "is left out, as [data] has no name"
+        raise InputError(
+            f"representation {representation.name}: its data is {representation.data or 'missing'}:"
+            f" it {expected}"
+        )
+
+    def sets(self, name: str) -> int:
+        """How many data sets there are of a name: as many as encoders need that are made of it."""
+        data = self.named_data[name]
+        if data.folder or data.sets:
+            return data.sets or 1
+        made = [each for each in self.observed if isinstance(each, ByName)]
+        return max(each.encoders or 1 for each in made if self.data_of(each) == name)
+
     def _check_data(self) -> None:
         """Check where data come from, and that the study can make its encoders of them."""
         if self.training and not self.data:
             raise InputError("training is for encoders made by the study: [data] is missing")
+        unused = {*self.named_data}
         for given, representation in zip(self.representations, self.observed, strict=True):
             if not isinstance(representation, ByName):
                 continue
-            if not (isinstance(given, str) or self.data):
+            if not self.data:
+                if isinstance(given, str):
+                    continue
                 raise InputError(
                     f"representation {representation.name} is trained by the study, on the states "
                     "that [data] gives: [data] is missing"
                 )
-            sets = self.data.sets if self.data else 1
-            if sets < (representation.encoders or 1) and not representation.is_drawn:
+            name = self.data_of(representation)
+            unused.discard(name)
+            if self.sets(name) < (representation.encoders or 1) and not representation.is_drawn:
                 raise InputError(
                     f"representation {representation.name}: {representation.kind} has no seed, so "
                     "encoders of the same data are the same: leave out encoders, or collect as "
                     "many data.sets"
                 )
+        if unused:
+            raise InputError(f"{data_key(min(unused))} is used by no representation: leave it out")
 
     def _check_tasks(self) -> None:
         """Check what can be checked of tasks without making their environments."""
@@ -213,14 +285,9 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             ) from None
 
     def _check_verdicts(self) -> None:
-        """Check that what is to be decided is there, and that the runs could decide it."""
-        cells = {
-            f"{task}/{algorithm}/{each.name}": each
-            for task, algorithm, each in product(self.tasks, self.algorithms, self.observed)
-            if each.name != self.baseline
-        }
+        """Check that what is claimed can be compared, and that the runs could decide it."""
         short = {full: name for name, full in SHORT_NAMES.items()}
-        if self.verdicts.primary and (long := [task for task in self.tasks if task in short]):
+        if self.verdicts.claims and (long := [task for task in self.tasks if task in short]):
             raise InputError(
                 f"tasks has {long[0]}: say {short[long[0]]}, as tables do, where there are verdicts"
             )
@@ -230,59 +297,51 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 f"verdicts.baseline is {baseline!r}: it must be one of the representations, "
                 f"{', '.join(names)}"
             )
-        self._check_looks()
-        for cell in self.verdicts.primary:
-            if cell not in cells or not self.comparisons:
+        for claim in self.verdicts.stated:
+            if unknown := {claim.x, claim.y}.difference(names):
                 raise InputError(
-                    f"verdicts.primary has {cell}: it must be of TASK/ALGORITHM/REPRESENTATION of "
-                    f"this study, compared with {self.baseline}"
+                    f"verdicts.claims has {str(claim)!r}: {min(unknown)} is none of the "
+                    f"representations, {', '.join(names)}"
                 )
-            for claim in self.verdicts.claims:
-                if reason := obstacle(self.verdicts, claim, self.arms(cells[cell])):
-                    raise InputError(
-                        f"verdicts: no outcome could support {claim!r} of {cell}: {reason}"
-                    )
-        for each in self.observed:
-            shares = each.shares(self.seeds)
-            if min(shares) < 2 and len(set(shares)) > 1:
-                runs = len(self.seeds)
-                raise InputError(
-                    f"{each.name} has {each.encoders} encoders for {runs} seeds: each must have "
-                    f"one run, or each at least two, so give at most {runs // 2}, or {runs}"
-                )
+        without = [task for task in self.tasks if task not in HEURISTICS]
+        absolute = all(claim.claim != NOT_WORSE for claim in self.verdicts.stated)
+        if without and not (absolute or self.verdicts.reference):
+            raise InputError(
+                f"verdicts.claims has {NOT_WORSE.name!r}: name verdicts.reference, a policy or a "
+                f"return that scores 1, as {without[0]} has no hand-written policy"
+            )
+        for claim, units in self.units.items():
+            if reason := obstacle(claim, units, self.planned.share):
+                raise InputError(f"verdicts: no outcome could support {str(claim)!r}: {reason}")
 
-    def _check_looks(self) -> None:
-        counts, looks = self.planned.counts, f"verdicts.looks are {list(self.verdicts.looks)}"
-        if len(set(counts)) < len(counts):
-            raise InputError(
-                f"{looks}: of {len(self.seeds)} seeds, they come after "
-                f"{' and '.join(map(str, counts))}"
-            )
-        if self.verdicts.primary and FEWEST_UNITS > counts[0] < counts[-1]:
-            raise InputError(
-                f"{looks}: the first comes after {counts[0]} seeds, and verdicts take "
-                f"{FEWEST_UNITS}"
-            )
+    @property
+    def has_claims(self) -> bool:
+        """Whether it claims something, so that it is registered before its first run."""
+        return bool(self.verdicts.claims)
 
     @property
     def baseline(self) -> str:
         """The representation that the others are compared with."""
         return self.verdicts.baseline_of(each.name for each in self.observed)
 
-    def arms(self, representation: Representation) -> Arms:
-        """How many runs are planned of a representation, and units of it and of the baseline."""
-        (baseline,) = [each for each in self.observed if each.name == self.baseline]
-        return Arms(len(self.seeds), self._units(representation), self._units(baseline))
-
-    def _units(self, representation: Representation) -> int:
-        """Encoders, if there are enough for tests; else runs."""
-        encoders = len(representation.shares(self.seeds))
-        return encoders if encoders >= FEWEST_UNITS else len(self.seeds)
+    @property
+    def units(self) -> dict[Stated, int]:
+        """How many runs or encoders each claim is tested on."""
+        named = {each.name: each for each in self.observed}
+        found = {}
+        for claim in self.verdicts.stated:
+            sides = [
+                [named[name].encoder_seed(seed) for seed in self.seeds]
+                for name in (claim.x, claim.y)
+            ]
+            linked = len(linked_units(sides))
+            found[claim] = linked if linked >= FEWEST_UNITS else len(self.seeds)
+        return found
 
     @property
     def planned(self) -> Planned:
         """What would reach verdicts, if the study were registered as it is."""
-        return Planned(self.verdicts, self.seeds)
+        return Planned(self.verdicts, self.seeds, tuple(product(self.tasks, self.algorithms)))
 
     @cached_property
     def observed(self) -> tuple[Representation, ...]:
@@ -297,8 +356,11 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     def flat(self) -> dict[str, Any]:
         """Its settings, those of each learner under algorithms.NAME, as in its file."""
         plain = to_plain(self)
-        learners = plain.pop("learners", {})
-        return {**plain, **{f"algorithms.{name}": table for name, table in learners.items()}}
+        learners, data = plain.pop("learners", {}), plain.pop("data") or {}
+        tables = {f"algorithms.{name}": table for name, table in learners.items()}
+        for name, table in data.items():
+            tables[data_key(name)] = {**table, "sets": self.sets(name)}
+        return {**plain, **tables}
 
     def toml(self) -> str:
         """The file that describes it."""
@@ -307,8 +369,9 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         }
         if learners := given.pop("learners", {}):
             given["algorithms"] = {name: learners.get(name, {}) for name in self.algorithms}
-        if self.data:  # either steps or a folder is given there
-            given["data"] = {n: value for n, value in given["data"].items() if value not in ("", 0)}
+        if self.data:
+            tables = {name: data.table for name, data in self.named_data.items()}
+            given["data"] = tables.get("", tables)
         return toml_text(given)
 
     @property
@@ -324,10 +387,10 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             lines.append("This study compares nothing: it has one representation.")
         elif len(self.seeds) == 1:
             lines.append("This study compares nothing: it has one seed.")
-        elif not self.verdicts.primary:
+        elif not self.verdicts.claims:
             lines.append(
-                "This study is exploratory: its report will give no verdicts, as its file names no "
-                "cell in verdicts.primary."
+                "This study is exploratory: its report will give no verdicts, as its file has no "
+                "verdicts.claims."
             )
         for name in self.algorithms:
             learner = self.learner(name)
@@ -387,6 +450,32 @@ def as_study(given: Mapping[str, Any]) -> Study:
         given["algorithms"] = [*tables]
         given["learners"] = {name: table for name, table in learners.items() if table}
     return from_plain(given, Study)
+
+
+def _read_data(given: Mapping[str, Any] | None) -> Mapping[str, Data] | None:
+    """Data by name, from the table of the only one, which has no name, or a table for each.
+
+    Raises:
+        InputError: both are mixed, or as `Data`.
+    """
+    if given is None:
+        return None
+    tables = [name for name, value in given.items() if isinstance(value, Mapping | Data)]
+    if not tables:
+        return {"": from_plain(given, Data, "data")}
+    if others := [name for name in given if name not in tables]:
+        raise InputError(
+            f"data has {others[0]} beside the table {tables[0]}: it must have either the keys of "
+            "one, or a table for each"
+        )
+    for name in tables if tables != [""] else ():
+        converted(name, _DataName, "the name of data")
+    return {name: from_plain(given[name], Data, data_key(name)) for name in tables}
+
+
+def data_key(name: str) -> str:
+    """What files call data of a name, which is empty where there are no others."""
+    return f"data.{name}" if name else "data"
 
 
 def _learner(name: str, table: Any) -> Learner:

@@ -20,6 +20,7 @@ from jbrep.rl.run import trainer_of
 from jbrep.rl.settings import COHORT, CPU, CUDA
 from jbrep.rl.speed import estimate
 from jbrep.stats.power import Prospect, prospects
+from jbrep.study.costs import Cost, costs
 from jbrep.study.plan import Cell, Plan
 from jbrep.study.prepare import check
 from jbrep.study.representations import ByCode, ByName
@@ -146,7 +147,8 @@ class Forecast(NamedTuple):
     seconds: float  # on one core, besides data and encoders
     elapsed: float  # with so many workers [s]
     workers: int
-    prospects: list[Prospect]  # of its primary cells
+    prospects: list[Prospect]  # of its claims
+    made_first: list[Cost]  # data and encoders
 
 
 def forecast(plan: Plan, workers: int | None = None, width: int | None = None) -> Forecast:
@@ -172,14 +174,14 @@ def forecast(plan: Plan, workers: int | None = None, width: int | None = None) -
         )
     }
     each = [seconds[_kind(pack)] for pack in packs]
-    arms = {cell.label: plan.study.arms(cell.representation) for cell in plan.cells}
     return Forecast(
         runs=[(cell, i + 1, each[i]) for i, pack in enumerate(packs) for cell in pack],
         done=len(plan.cells) - sum(map(len, packs)),
         seconds=sum(each),
         elapsed=until_done(each, workers),
         workers=workers,
-        prospects=list(prospects(plan.study.planned, arms)),
+        prospects=list(prospects(plan.study.planned, plan.study.units)),
+        made_first=costs(plan),
     )
 
 

@@ -1,25 +1,28 @@
 """A study's folder: where its files are, and which runs it has."""
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import product
 from pathlib import Path
 
+from jbrep.dataset.manifest import MANIFEST, read_manifest
+from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.envs.description import describe
 from jbrep.envs.instances import memory_of_each
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
+from jbrep.records.commit import in_work_tree
 from jbrep.records.document import read_document
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists, inside, make_folder
 from jbrep.rl import Run
-from jbrep.rl.files import RUN
+from jbrep.rl.files import RUN, RunRecord
 from jbrep.rl.learner import Learner
 from jbrep.study.config import Study
 from jbrep.study.registration import REGISTRATION, Registration, read_registration
-from jbrep.study.representations import Representation
+from jbrep.study.representations import ByName, Representation
 from jbrep.study.work import Assigned
 from jbrep.text import slug
 from jbrep.training.trainer import get_device
@@ -33,6 +36,7 @@ _GRID = (  # may change
     "evaluations",
     "title",
 )
+_GRID_TABLES = "algorithms.", "data."
 
 
 @dataclass(frozen=True)
@@ -67,10 +71,11 @@ class Plan:
     Args:
         study: what to run.
         folder: of this study alone.
+        file: the study's, if it has one; its registration is beside it.
     """
 
-    def __init__(self, study: Study, folder: str | Path):
-        self.study = study
+    def __init__(self, study: Study, folder: str | Path, file: Path | None = None):
+        self.study, self.file = study, file
         self.folder = Path(folder).absolute()  # workers may have another working directory
 
     @cached_property
@@ -85,6 +90,11 @@ class Plan:
     def registration(self) -> Registration | None:
         """What was written down before the first run; None if nothing was."""
         return read_registration(self.folder)
+
+    @property
+    def in_git(self) -> bool:
+        """Whether the study's file, and so what is registered beside it, can be committed."""
+        return self.file is not None and in_work_tree(self.file)
 
     @property
     def device(self) -> str:
@@ -142,15 +152,55 @@ class Plan:
 
     @property
     def fingerprints(self) -> dict[str, str]:
-        """The SHA-256 of each run's encoder, by the run's label and seed.
+        """The SHA-256 of encoders that the study doesn't make, by the name of the run.
 
         Raises:
             InputError: one is missing.
         """
         return {
-            f"{cell.label}/seed-{cell.seed}": self.run(cell).find_encoder().fingerprint
+            cell.name: self.run(cell).find_encoder().fingerprint
             for cell in self.cells
+            if not (self.study.data and isinstance(cell.representation, ByName))
         }
+
+    @property
+    def policies(self) -> dict[str, str]:
+        """SHA-256 of the files of policies that acted in its data sets, by their paths there.
+
+        Raises:
+            InputError: a data set is damaged.
+        """
+        manifests = {
+            path.parent.relative_to(self.folder): read_manifest(path.parent)
+            for path in sorted((self.folder / "data").rglob(MANIFEST))
+        }
+        return {
+            f"{folder}/{part['file']}": part["sha256"]
+            for folder, manifest in manifests.items()
+            for part in parts_of(manifest.settings.policy)
+            if part["kind"] == TRAINED
+        }
+
+    @property
+    def existing_data(self) -> dict[str, str]:
+        """The fingerprints of data sets that the study doesn't make, by their folders."""
+        folders = {
+            data.existing(task)
+            for data in self.study.named_data.values()
+            if data.folder
+            for task in self.study.tasks
+        }
+        there = sorted(folder for folder in folders if exists(folder / MANIFEST))
+        return {str(folder): read_manifest(folder).fingerprint for folder in there}
+
+    def deviations(self, runs: Collection[RunRecord]) -> list[str]:
+        """How what ran differs from what was registered, in sentences; none if nothing was."""
+        if self.registration is None:
+            return []
+        return [
+            *self.registration.deviations(self.study, runs),
+            *self.registration.other_data(self.policies, self.existing_data),
+        ]
 
     def assigned(self, cells: Iterable[Cell]) -> list[Assigned]:
         """Runs for a worker.
@@ -164,10 +214,17 @@ class Plan:
         """The folder of the encoders that the study trains for a task."""
         return inside(self.folder, "encoders", slug(task))
 
-    def data(self, task: str, number: int = 0) -> Path:
-        """The folder of a data set that the study collects for a task, one of several or alone."""
-        several = self.study.data is not None and self.study.data.sets > 1
-        return inside(self.folder, "data", slug(task), *([f"set-{number}"] if several else ()))
+    def data(self, task: str, number: int = 0, name: str = "") -> Path:
+        """The folder of a data set that the study collects for a task, one of several or alone.
+
+        Args:
+            task: its name.
+            number: of the data set.
+            name: of the data; empty for those of the only table.
+        """
+        several = name in self.study.named_data and self.study.sets(name) > 1
+        of_set = [f"set-{number}"] if several else []
+        return inside(self.folder, "data", *([name] if name else []), slug(task), *of_set)
 
     def check_folder(self) -> None:
         """Check that the folder is free, or holds this study.
@@ -211,33 +268,44 @@ class Plan:
         """Whether it has runs, at whatever step."""
         return any((self.folder / "runs").glob("**/*.*"))
 
-    def register(self) -> Registration:
-        """Write down what is going to be run; what is registered already stays as it is.
+    def register(self, registration: Registration) -> None:
+        """Write down what is going to be run.
 
         Raises:
-            InputError: there are runs already, or an encoder is missing.
+            InputError: there are runs already, or something else is registered.
         """
         if self.registration is None:
-            if self.has_begun:
-                raise InputError(
-                    f"{self.folder} has runs: a study is registered before its first run"
-                )
-            self.registration = Registration.of(self.study, self.fingerprints)
+            self.check_new()
+            self.registration = registration
             self.registration.write(self.folder / REGISTRATION)
-        return self.registration
+        elif self.registration.sha256 != registration.sha256:
+            raise InputError(
+                f"{self.folder} holds the study as it was registered otherwise, on "
+                f"{self.registration.date[:10]}: choose another --out"
+            )
+
+    def check_new(self) -> None:
+        """Check that there are no runs.
+
+        Raises:
+            InputError: there are.
+        """
+        if self.has_begun:
+            raise InputError(f"{self.folder} has runs: a study is registered before its first run")
 
 
 def _differing(there: Study, study: Study) -> str:
     """What differs of two studies besides their grids; empty if nothing does.
 
-    A learner that only one of them has is part of its grid.
+    A learner that only one of them has is part of its grid, and so are data with a name.
     """
-    of_one = {f"algorithms.{name}" for name in there.learners.keys() ^ study.learners.keys()}
-    before, now = (
-        {name: value for name, value in each.flat().items() if name not in of_one.union(_GRID)}
-        for each in (there, study)
-    )
-    return differences(before, now)
+    before, now = there.flat(), study.flat()
+    of_one = {name for name in before.keys() ^ now.keys() if name.startswith(_GRID_TABLES)}
+    kept = [
+        {name: value for name, value in each.items() if name not in of_one.union(_GRID)}
+        for each in (before, now)
+    ]
+    return differences(*kept)
 
 
 def read_plan(folder: Path) -> Plan | None:

@@ -1,6 +1,7 @@
 """What was run, in one file: every run, the settings under each label, the unfinished runs."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -19,7 +20,7 @@ from jbrep.records.record import MOST_WHOLE, Record, Sha256, Version, from_plain
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, RunRecord
 from jbrep.rl.run_settings import RunSettings, SharedSettings
-from jbrep.stats.rules import Rules
+from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan, read_plan
@@ -109,6 +110,7 @@ class RegistrationFacts(Record, frozen=True, kw_only=True):
     sha256: Sha256
     date: str  # ISO 8601, in UTC
     deviations: list[str]  # in sentences
+    seeds: tuple[int, ...] = ()  # of the runs that its verdicts count; others are exploratory
 
 
 class RunsRecord(Document, frozen=True, kw_only=True):
@@ -145,6 +147,13 @@ class RunsRecord(Document, frozen=True, kw_only=True):
         if self.study:
             return self.study.baseline
         return Rules().baseline_of(each.settings.representation for each in self.labels.values())
+
+    @property
+    def planned(self) -> Planned:
+        """What is compared, and what gets verdicts: only what was registered."""
+        if self.study and self.registration:
+            return replace(self.study.planned, seeds=self.registration.seeds)
+        return Planned(Rules(baseline=self.baseline))
 
     @property
     def tasks(self) -> dict[str, Task]:
@@ -278,7 +287,12 @@ def _registration(plan: Plan, runs: Collection[RunRecord]) -> RegistrationFacts 
     if (found := plan.registration) is None:
         return None
     deviations = found.deviations(plan.study, runs)
-    return RegistrationFacts(sha256=found.sha256, date=found.date, deviations=deviations)
+    return RegistrationFacts(
+        sha256=found.sha256,
+        date=found.date,
+        deviations=deviations,
+        seeds=found.registered.seeds,
+    )
 
 
 def _distinct(values: Iterable[_Value]) -> list[_Value]:

@@ -6,8 +6,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from jbrep.errors import differences
-from jbrep.records.commit import CHANGES, commits
+from jbrep.errors import InputError, differences
+from jbrep.records.commit import CHANGES, commits, in_work_tree, is_committed
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Version, from_plain, to_plain
 from jbrep.records.storage import exists
@@ -18,17 +18,20 @@ from jbrep.study.config import Study
 REGISTRATION = "registration.json"
 
 
-class Registration(Document, frozen=True, kw_only=True):
-    """registration.json."""
+class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
+    """registration.json, beside a study's file and in its folder."""
 
     format = "jbrep registration"
-    format_version = 1
+    format_version = 2
 
     study: dict[str, Any]  # as it was written
-    encoders: dict[str, str]  # SHA-256 by the name of the run; older ones: of those that were there
+    encoders: dict[str, str]  # SHA-256 of those that are there beforehand, by the name of the run
+    policies: dict[str, str] = {}  # SHA-256 of those that collect data, by file, see `Plan`
+    data: dict[str, str] = {}  # fingerprints of those that are there beforehand, by folder
     date: str  # ISO 8601, in UTC
     versions: dict[Version, Version]  # by package
     commits: dict[str, str]
+    committed: bool = True  # before the first run; False where no git would have it
 
     def check(self) -> None:
         """As for `Record`: check that a study was registered."""
@@ -36,26 +39,20 @@ class Registration(Document, frozen=True, kw_only=True):
 
     @cached_property
     def registered(self) -> Study:
-        """The study; verdicts that don't say what gains are counted over count over standing still.
-
-        All did when the first studies were registered.
-        """
-        study = from_plain(self.study, Study, "study")
-        if not study.verdicts.primary or "gains_over" in self.study["verdicts"]:
-            return study
-        return study.replace(verdicts=study.verdicts.replace(gains_over="still"))
+        """The study."""
+        return from_plain(self.study, Study, "study")
 
     @classmethod
-    def of(cls, study: Study, encoders: Mapping[str, str]) -> "Registration":
+    def of(cls, study: Study, **beforehand: Any) -> "Registration":
         """The registration of a study, now.
 
         Args:
             study: its settings.
-            encoders: their SHA-256, by the name of the run.
+            beforehand: encoders, policies and data that are there, and committed.
         """
         return cls(
-            study=_explicit(study),
-            encoders=dict(encoders),
+            study=to_plain(study),
+            **beforehand,
             date=datetime.now(UTC).isoformat(timespec="seconds"),
             versions=packages(),
             commits=dict(commits()),
@@ -74,7 +71,7 @@ class Registration(Document, frozen=True, kw_only=True):
             study: its settings now.
             runs: all that have ended.
         """
-        found = []
+        found = [] if self.committed else ["its registration is in no commit"]
         if differing := self.differences(study):
             found.append(f"settings differ: {differing}")
         if added := [seed for seed in study.seeds if seed not in self.registered.seeds]:
@@ -88,6 +85,20 @@ class Registration(Document, frozen=True, kw_only=True):
             if others := {run.versions.get(name, "none") for run in runs} - {version}:
                 found.append(f"{name} was {_listed(sorted(others))}, not {version}")
         return [*found, *self._other_code(run.commits.get("jbrep") for run in runs)]
+
+    def other_data(self, policies: Mapping[str, str], data: Mapping[str, str]) -> list[str]:
+        """How policies that collected data, and data that were there, differ, in sentences.
+
+        Args:
+            policies: SHA-256 of those that acted, by file.
+            data: fingerprints, by folder.
+        """
+        found = []
+        if other := [name for name, each in policies.items() if self.policies.get(name) != each]:
+            found.append(f"other policies than were registered collected data: {_listed(other)}")
+        if other := [name for name, each in data.items() if self.data.get(name) != each]:
+            found.append(f"data are others than were registered: {_listed(other)}")
+        return found
 
     def _other_code(self, ran: Iterable[str | None]) -> list[str]:
         """How the code that ran, by its commits, differs from that which was registered."""
@@ -113,12 +124,33 @@ def read_registration(folder: Path) -> Registration | None:
     return read_document(path, Registration) if exists(path) else None
 
 
-def _explicit(study: Study) -> dict[str, Any]:
-    """A study as it is registered: its verdicts say what gains are counted over."""
-    plain = to_plain(study)
-    if study.verdicts.primary:
-        plain["verdicts"]["gains_over"] = study.verdicts.gains_over
-    return plain
+def beside(file: Path) -> Path:
+    """Where the registration of a study's file is."""
+    return file.with_name(f"{file.stem}.{REGISTRATION}")
+
+
+def find_committed(file: Path, study: Study) -> Registration | None:
+    """The registration beside a study's file; None where there is none and needs to be none.
+
+    Raises:
+        InputError: it isn't in the last commit of the repository that the file lies in, or of
+            another study; or a study with claims has none there.
+    """
+    path, in_git = beside(file), in_work_tree(file)
+    if not exists(path) and not (in_git and study.has_claims):
+        return None
+    if in_git and not is_committed(path):
+        state = "isn't as in the last commit" if exists(path) else "is missing"
+        raise InputError(
+            f"{path} {state}: register the study with --register, commit that file, then run it"
+        )
+    found = read_document(path, Registration)
+    if differing := found.differences(study):
+        raise InputError(
+            f"{path} is of another study than {file}: {differing}; register it with --register, "
+            "commit that file, then run it"
+        )
+    return found
 
 
 def _listed(values: Iterable[object]) -> str:

@@ -84,10 +84,12 @@ class ByName(Representation, frozen=True, kw_only=True):
     Attributes:
         kind: of the encoder.
         training: settings of the encoder.
+        data: the name of the data that it is made from; None where that goes without saying.
     """
 
     kind: str
     training: dict[str, Any]
+    data: str | None = None
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
         """As for `Representation`."""
@@ -192,8 +194,9 @@ def read_representation(given: Given, training: Mapping[str, Any]) -> Representa
 
     Args:
         given: full, the name of an encoder, such as dae-8, or a table with a name and one of: code;
-            file; kind, with the settings of that method; or for several encoders of one, encoders,
-            which may also stand beside file or kind.
+            file; kind, with the settings of that method; or what a name doesn't say: encoders, how
+            many there are, which may also stand beside file or kind, and data, of which they are
+            made, which may stand beside kind.
         training: settings of encoders that the study trains, other than the usual.
 
     Raises:
@@ -210,7 +213,8 @@ def read_representation(given: Given, training: Mapping[str, Any]) -> Representa
 
 def _of_table(given: Mapping[str, Any], training: Mapping[str, Any]) -> Representation:
     name: str = converted(given.get("name"), _OwnName, "name")
-    settings = {key: value for key, value in given.items() if key not in ("name", "encoders")}
+    beside = {key: given[key] for key in ("encoders", "data") if key in given}
+    settings = {key: value for key, value in given.items() if key not in ("name", *beside)}
     match settings:
         case {"file": _}:
             return from_plain(given, ByFile)
@@ -218,19 +222,17 @@ def _of_table(given: Mapping[str, Any], training: Mapping[str, Any]) -> Represen
             return from_plain(given, ByCode)
         case {"kind": str(kind), **own}:
             recipe = Recipe(get_method(kind), own)
-        case _ if "encoders" in given and not settings:
+        case _ if beside and not settings:
             recipe = read_name(name)
         case _:
             raise InputError(
-                "it must have a name and one of file, code, kind (with settings) or encoders (a "
-                "number)"
+                "it must have a name and one of file, code, kind (with settings), encoders (a "
+                "number) or data"
             )
     check_name(name)
     fitted = _training(recipe, training)
     recipe.method.of(fitted)
-    representation = ByName(
-        name=name, encoders=given.get("encoders"), kind=recipe.method.name, training=fitted
-    )
+    representation = ByName(name=name, kind=recipe.method.name, training=fitted, **beside)
     if representation.encoders is not None and "seed" in fitted:
         raise InputError(
             f"its encoders have the seeds 0 to {representation.encoders - 1}: leave out seed"

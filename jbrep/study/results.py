@@ -27,9 +27,9 @@ from jbrep.rl.files import (
 )
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.curves import common_grid
-from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.runs import groups
-from jbrep.study.plan import STUDY
+from jbrep.stats.scale import BLIND, LOOKING, best_blind
+from jbrep.study.plan import STUDY, read_plan
 from jbrep.study.record import RECORD, LabelSettings, RunFacts, RunsRecord, runs_record
 from jbrep.study.tables import (
     REFERENCE_RETURNS,
@@ -63,7 +63,9 @@ def write_tables(folder: Path) -> list[Path]:
     """
     ended, former = _ended(folder), former_record(folder)
     before, played_on = (former.tables, former.tasks) if former else ({}, {})
-    references = write_references(_tasks(ended.values()), folder, before, played_on)
+    plan = read_plan(folder)
+    top = plan.study.verdicts.reference if plan else ""
+    references = write_references(_tasks(ended.values()), folder, before, played_on, top)
     rows, infos = list(_returns(ended)), list(_of_runs(ended, read_infos))
     tables = {name: before[name] for name in (DIAGNOSTICS,) if name in before}
     tables[RETURNS] = write_rows(folder / RETURNS, rows, Return)
@@ -80,7 +82,6 @@ def found(
     record: RunsRecord,
     returns: Sequence[Return],
     references: References,
-    planned: Planned,
     across_trainers: bool = False,
 ) -> tuple[Analysis | None, list[str]]:
     """The statistics of what the tables of a study say, if its runs allow any.
@@ -89,7 +90,6 @@ def found(
         record: runs.json.
         returns: returns.csv.
         references: references.csv.
-        planned: what reaches verdicts.
         across_trainers: compare runs of different trainers, too.
 
     Returns:
@@ -99,8 +99,8 @@ def found(
     Raises:
         InputError: a run has returns that it can't have.
     """
-    runs = _curves(record, returns, references, planned.rules)
-    planned = replace(planned, prevented=_prevented(record, references, planned.rules))
+    planned = replace(record.planned, prevented=_prevented(record, references))
+    runs = _curves(record, returns, references)
     if across_trainers:
         runs = [replace(run, trainer="") for run in runs]
     compared, left_out = _comparable(runs, planned.rules.baseline)
@@ -121,7 +121,7 @@ def read_runs(folder: Path) -> list[RunCurve]:
     """
     ended = _ended(folder)
     references = read_references(folder, table_hashes(folder).get(REFERENCE_RETURNS))
-    return _curves(runs_record(folder, ended, {}), _returns(ended), references, Rules())
+    return _curves(runs_record(folder, ended, {}), _returns(ended), references)
 
 
 def has_runs(folder: Path) -> bool:
@@ -207,33 +207,35 @@ def _of_runs(ended: Ended, read: Callable[[Path], Iterable[NamedTuple]]) -> Iter
 
 
 def _curves(
-    record: RunsRecord, returns: Iterable[Return], references: References, rules: Rules
+    record: RunsRecord, returns: Iterable[Return], references: References
 ) -> list[RunCurve]:
     """The runs of a study, from its tables."""
     evaluated = by_run(returns)
-    counted_over = {task: _counted_over(played, rules) for task, played in references.items()}
     return [
         _curve(
             run,
             settings,
             record.draws_of(settings.learner),
             evaluated.get((run.label, run.seed), {}),
-            counted_over.get(settings.task, ()),
+            references.get(settings.task, {}),
+            record.planned.rules.reference or LOOKING,
         )
         for run, settings in ((run, record.settings_of(run)) for run in record.runs)
     ]
 
 
-def _prevented(record: RunsRecord, references: References, rules: Rules) -> dict[str, str]:
-    """Why there are no verdicts on tasks, by name, where what gains count over isn't known."""
+def _prevented(record: RunsRecord, references: References) -> dict[str, str]:
+    """Why there are no verdicts on tasks, by name, where what scores 0 or 1 isn't known."""
+    named = record.planned.rules.reference
+    needed = (*BLIND, named) if isinstance(named, str) and named else BLIND
     tasks = {record.settings_of(run).task for run in record.runs}
     unknown = {
-        task: [policy for policy in rules.counted_over if policy not in references.get(task, {})]
+        task: [policy for policy in needed if policy not in references.get(task, {})]
         for task in tasks
     }
     return {
-        task: f"what {listed(policies)} would return isn't known, and gains count over it: make "
-        f"the report where {task} is installed"
+        task: f"what {listed(policies)} would return isn't known, by which returns are scored: "
+        f"make the report where {task} is installed"
         for task, policies in unknown.items()
         if policies
     }
@@ -248,22 +250,18 @@ def _mean(returns: Sequence[float]) -> float | None:
     return float(np.mean(returns)) if len(returns) else None
 
 
-def _counted_over(played: Mapping[str, Sequence[float]], rules: Rules) -> Sequence[float]:
-    """The returns of the policy that gains are counted over; none if it isn't known."""
-    policy = rules.reference({name: float(np.mean(each)) for name, each in played.items()})
-    return played[policy] if policy else ()
-
-
 def _curve(
     run: RunFacts,
     shared: LabelSettings,
     drawn: Collection[str],
     by_step: Mapping[int, list[float]],
-    counted_over: Sequence[float],
+    played: Mapping[str, Sequence[float]],
+    top: str | float,
 ) -> RunCurve:
     """A run, from its settings without the seed and what that draws, and its returns by step.
 
-    The returns that gains are counted over are those of a policy in the first episodes.
+    What was played, by policy, was so from the same starts. What scores 1 is one of these policies,
+    or a return.
     """
     task, settings = shared.environment, to_plain(shared)
     if drawn:  # the overrides say the hyperparameters
@@ -275,6 +273,10 @@ def _curve(
     episodes = min(map(len, returns), default=0)  # the last evaluation may have more
     if any(len(each) > episodes for each in returns[:-1]):
         raise InputError(f"run {run.label}, seed {run.seed}: evaluations differ in their episodes")
+    blind = played.get(
+        best_blind({n: float(np.mean(each)) for n, each in played.items()}) or "", ()
+    )
+    able = (top,) * shared.final_episodes if isinstance(top, float) else played.get(top, ())
     return RunCurve(
         task=task.name,
         algorithm=shared.learner,
@@ -287,8 +289,10 @@ def _curve(
         failed_at=run.steps if run.status == FAILED else None,
         return_floor=task.return_floor,
         return_ceiling=task.return_ceiling,
-        reference=_mean(counted_over[: shared.final_episodes]),
-        reference_in_training=_mean(counted_over[:episodes]),
+        reference=_mean(blind[: shared.final_episodes]),
+        reference_in_training=_mean(blind[:episodes]),
+        top=_mean(able[: shared.final_episodes]),
+        top_in_training=_mean(able[:episodes]),
         solved=task.solved_return,
         trainer=" ".join(trainer),
         environment=_environment(task),

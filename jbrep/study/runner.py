@@ -4,7 +4,8 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable
-from contextlib import AbstractContextManager, closing, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, nullcontext
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -13,17 +14,23 @@ from rich.table import Table
 
 from jbrep.envs.names import imported_modules
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
+from jbrep.records.document import read_document
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import make_folder
+from jbrep.records.storage import exists, make_folder
 from jbrep.rl.files import FAILED, FINISHED, read_run
 from jbrep.rl.job import Job
 from jbrep.rl.settings import CUDA
 from jbrep.study.packing import Pack, packed, usual_workers
 from jbrep.study.plan import STUDY, Cell, Plan
-from jbrep.study.prepare import check, prepare
-from jbrep.study.registration import REGISTRATION, Registration
+from jbrep.study.prepare import check, policies, prepare
+from jbrep.study.registration import (
+    REGISTRATION,
+    Registration,
+    beside,
+    find_committed,
+)
 from jbrep.study.tables import REFERENCE_RETURNS
-from jbrep.study.work import CRASHED, Outcome, read_progress, work
+from jbrep.study.work import CRASHED, Outcome, read_progress, say, work
 from jbrep.text import duration
 
 _OWN = STUDY, REGISTRATION, REFERENCE_RETURNS, "data", "encoders", "runs"  # see `make_folder`
@@ -107,7 +114,7 @@ def run_study(
 ) -> int:
     """Collect data, train encoders, and train every agent that hasn't been trained yet.
 
-    A study that names primary cells is registered first, unless it has begun.
+    A study with claims is registered first: beside its file, in a commit, where git has that file.
 
     `jbrep.study.results.write_tables` then writes what came of it.
 
@@ -121,19 +128,22 @@ def run_study(
         How many runs crashed.
 
     Raises:
-        InputError: the folder holds another study, the study's settings can't be used, or memory
-            doesn't hold as many agents.
+        InputError: the folder holds another study, the study's settings can't be used, it isn't
+            registered as it must be, or memory doesn't hold as many agents.
     """
+    registered = find_committed(plan.file, plan.study) if plan.file else None
     check(plan)
     workers, unfinished = workers or usual_workers(plan), plan.unfinished
     packed(plan, workers, width)  # so that too little memory shows before anything is written
     make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
         plan.begin()
-        prepare(plan)
+        if registered:
+            plan.register(registered)
+        elif plan.study.has_claims and not plan.has_begun:
+            _register(plan)
+        prepare(plan, workers)
         packs = packed(plan, workers, width)  # by the sizes of encoders that are there now
-        if plan.study.verdicts.primary and not plan.has_begun:
-            plan.register()
         for cell in plan.cells:  # so that any mistake shows before the first run
             Job(plan.run(cell), plan.folder_of(cell)).clear()
         plan.write()  # not before: a study that is refused changes nothing
@@ -146,19 +156,45 @@ def run_study(
     return progress.counts[CRASHED]
 
 
-def register_study(plan: Plan) -> Registration:
-    """Collect data and train encoders, and write down what is going to be run on these.
+def register_study(plan: Plan) -> Path:
+    """Write down what is going to be run: beside the study's file, or in its folder without one.
+
+    What is registered already stays as it is.
+
+    Returns:
+        The registration's file.
 
     Raises:
-        InputError: as `run_study`, or there are runs already.
+        InputError: the study's settings can't be used, or there are runs already.
     """
     check(plan)
-    make_folder(plan.folder, _OWN)
-    with exclusive(plan.folder):
-        plan.begin()
-        prepare(plan)
-        plan.write()
-        return plan.register()
+    if plan.file is None:
+        make_folder(plan.folder, _OWN)
+        with exclusive(plan.folder):
+            plan.begin()
+            plan.write()
+            if plan.registration is None:
+                _register(plan)
+        return plan.folder / REGISTRATION
+    path = beside(plan.file)
+    if not exists(path) or read_document(path, Registration).registered != plan.study:
+        plan.check_new()
+        _registration(plan).write(path)
+    return path
+
+
+def _register(plan: Plan) -> None:
+    plan.register(_registration(plan))
+
+
+def _registration(plan: Plan) -> Registration:
+    return Registration.of(
+        plan.study,
+        encoders=plan.fingerprints,
+        policies=policies(plan),
+        data=plan.existing_data,
+        committed=plan.in_git,
+    )
 
 
 class Progress:
@@ -230,10 +266,3 @@ class Progress:
             return "-"
         seconds_per_step = (time.monotonic() - self._start) / done
         return duration(seconds_per_step * (len(self._unfinished) * steps - under_way))
-
-
-def say(line: str) -> None:
-    """Print a line on standard error, above a live table; a study goes on where that fails."""
-    if sys.stderr is not None:
-        with suppress(OSError):
-            print(line, file=sys.stderr, flush=True)

@@ -110,6 +110,7 @@ def write_references(
     folder: Path,
     before: Mapping[str, str],
     played_on: Mapping[str, Task] = {},
+    top: str | float = "",
 ) -> str | None:
     """Play the reference policies of tasks: three that don't look, and hand-written if there is.
 
@@ -120,6 +121,7 @@ def write_references(
         folder: for the file.
         before: what runs.json says of the tables. A file that is another is written anew.
         played_on: tasks by name as they were then; those that were others are played anew.
+        top: a further policy, which scores 1; a return isn't played.
 
     Returns:
         The SHA-256 of the file; None if there is nothing to write.
@@ -134,7 +136,7 @@ def write_references(
         there, damage = [], error
     rows = []
     for task, episodes in sorted(tasks, key=lambda each: each[0].name):
-        for policy in _policies(task):
+        for policy in _policies(task, top):
             own = [row for row in there if (row.task, row.policy) == (task.name, policy)]
             if played_on.get(task.name, task) != task:
                 own = []
@@ -175,9 +177,11 @@ def read_references(folder: Path, sha256: str | None) -> References:
     return found
 
 
-def _policies(task: Task) -> Iterator[str]:
-    """The reference policies that a task has."""
-    return (policy for policy in _POLICIES if policy != LOOKING or task.name in HEURISTICS)
+def _policies(task: Task, top: str | float = "") -> Iterator[str]:
+    """The reference policies that a task has, and one that is named."""
+    yield from (policy for policy in _POLICIES if policy != LOOKING or task.name in HEURISTICS)
+    if isinstance(top, str) and top:
+        yield top
 
 
 def _there(path: Path, before: Mapping[str, str]) -> list[_Reference]:
@@ -191,7 +195,7 @@ def _played(task: Task, policy: str, episodes: int) -> list[_Reference]:
     """The rows of a task and policy; none where its environment isn't here."""
     try:
         one_by_one = None if task.reproducible else 1  # a robot may exist once
-        returns = find_player(_POLICIES[policy], task).returns(episodes, one_by_one)
+        returns = find_player(_POLICIES.get(policy, policy), task).returns(episodes, one_by_one)
     except Exception:  # reports don't need the environments, whatever these lack
         return []
     return [_Reference(task.name, policy, i, rounded(each)) for i, each in enumerate(returns)]

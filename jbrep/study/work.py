@@ -1,5 +1,6 @@
 """Runs of a study, in a process of their own."""
 
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
@@ -107,3 +108,10 @@ class _ProgressFiles:
             shown = "-" if mean is None else rounded(mean)[0]
             write_note(folder / PROGRESS, f"{step} {shown}")
             self._written[folder] = now
+
+
+def say(line: str) -> None:
+    """Print a line on standard error, above a live table; a study goes on where that fails."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(line, file=sys.stderr, flush=True)

@@ -26,6 +26,7 @@ from jbrep.rl.job import packages
 from jbrep.rl.learner import Learner
 from jbrep.rl.overrides import check_shape
 from jbrep.study.config import as_study
+from jbrep.study.plan import Plan
 from jbrep.study.record import EncoderFacts, Label, LabelSettings
 from jbrep.study.tables import Return
 
@@ -45,8 +46,11 @@ STUDY = as_study(
         "evaluation_episodes": 2,
         "final_episodes": 5,
         "verdicts": {
-            "primary": ["face_direction/sac/dae-8", "face_direction/sac/pca-8"],
-            "failing": 0.25,
+            "claims": [
+                *(f"dae-8 {claim} than full" for claim in ("not worse", "less variable", "faster")),
+                "pca-8 not worse than full",
+            ],
+            "margin": 0.25,
         },
     }
 )
@@ -113,8 +117,9 @@ def _make_run(plan, cell):
 
 @contextmanager
 def of_a_commit():
-    """Code is of a commit in here, also where a contributor has changed some."""
+    """Code and registrations are of a commit in here, also where a contributor has changed some."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Plan, "in_git", True)
         for module in ("jbrep.study.registration", "jbrep.rl.job"):
             patch.setattr(f"{module}.commits", lambda: COMMITS)
         yield

@@ -27,7 +27,6 @@ from jbrep.dataset.manifest import read_manifest
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.envs.names import environment_versions
-from jbrep.records.document import read_document
 from jbrep.report import make_report
 from jbrep.report.report import STATISTICS, SUMMARY
 from jbrep.report.tables import read_tables
@@ -37,9 +36,9 @@ from jbrep.rl.job import Job, Session
 from jbrep.rl.trainers import train_jobs
 from jbrep.rl.tune import BEST, SEARCH
 from jbrep.study.config import Study
-from jbrep.study.plan import STUDY, Plan
+from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD
-from jbrep.study.registration import REGISTRATION, Registration
+from jbrep.study.registration import REGISTRATION, find_committed, read_registered
 from jbrep.study.runner import run_study
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
 
@@ -268,16 +267,14 @@ def _registration():
         command("study", folder / "it.toml", "--register", "--out", folder / "it")
 
     def result(folder):
-        registered = read_document(folder / "it" / REGISTRATION, Registration)
-        return digest(folder / "it" / STUDY), registered.study, registered.encoders
+        registered = read_registered(folder / f"it.{REGISTRATION}")
+        return registered.study, registered.encoders
 
     def files(folder):
-        return [folder / "it" / REGISTRATION, folder / "it" / STUDY]
+        return [folder / f"it.{REGISTRATION}"]
 
     def read(folder):
-        plan = Plan(TINY, folder / "it")
-        plan.write()
-        return plan.registration
+        return find_committed(folder / "it.toml", TINY)
 
     return Surface(act, result, files, read)
 

@@ -26,7 +26,6 @@ from jbrep.report.figures.style import (
     reference,
     with_runs,
 )
-from jbrep.report.words import over
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.study.tables import Return, by_run
 
@@ -245,17 +244,17 @@ def _draw_label(axes: Axes, runs: Runs, colour: str) -> None:
 
 
 def across_tasks(analysis: Analysis, looks: Looks) -> Plot:
-    """Performance profiles of gains across tasks, a panel for each algorithm."""
+    """Performance profiles of scores across tasks, a panel for each algorithm."""
     return Plot(
         "across_tasks",
         "Across tasks",
-        f"The share of n runs on each task whose gain over {over(analysis.planned.rules)} is above "
-        f"a share of that on {analysis.baseline} (dashed: as good), averaged over tasks, with its "
-        "95 % bootstrap interval (Agarwal et al. 2021).",
+        "The share of n runs on each task that score above a number, from 0 for the best policy "
+        "that doesn't look to 1 for a reference (dashed), averaged over tasks, with its 95 % "
+        "bootstrap interval (Agarwal et al. 2021).",
         ("algorithm", "representation", "tasks", "score", "share", "low", "high"),
         [
             (each.algorithm, each.representation, ", ".join(each.tasks), *map(cell, row))
-            for each in analysis.open_aggregates
+            for each in analysis.aggregates
             for row in zip(each.scores, *each.profile, strict=True)
         ],
         lambda: _draw(analysis, looks),
@@ -263,7 +262,7 @@ def across_tasks(analysis: Analysis, looks: Looks) -> Plot:
 
 
 def _draw(analysis: Analysis, looks: Looks) -> Figure:
-    aggregates = analysis.open_aggregates
+    aggregates = analysis.aggregates
     algorithms = list(dict.fromkeys(each.algorithm for each in aggregates))
     figure, panels = panel_grid(len(algorithms), 2.0)
     look = looks()
@@ -274,6 +273,6 @@ def _draw(analysis: Analysis, looks: Looks) -> Figure:
             name, colour = each.representation, look[each.representation]["color"]
             draw_profile(axes, each.scores, each.profile, with_runs(name, [each.runs]), colour)
         axes.set_title(plain(f"{algorithm}, {len(own[0].tasks)} tasks"))
-        axes.set_xlabel(f"share of the gain on {analysis.baseline}")
+        axes.set_xlabel("score")
     below(figure, panels)
     return figure

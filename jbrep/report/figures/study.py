@@ -6,10 +6,10 @@ from functools import partial
 import numpy as np
 
 from jbrep.encoders import FULL
-from jbrep.report.figures.claims import claim_plot
 from jbrep.report.figures.curves import Played, across_tasks, curves, every_run
 from jbrep.report.figures.diagnostics import diagnostics
 from jbrep.report.figures.diagrams import diagrams
+from jbrep.report.figures.differences import difference_plot, differences
 from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.returns import final_return, learning_rate, profiles
 from jbrep.report.figures.style import styles
@@ -40,8 +40,8 @@ def study_plots(
     plots, played = [], _on_all_starts(references, returns)
     if analysis:
         plots += [final_return(groups, looks), curves(groups, played, looks)]
-        if any(group.compared for group in groups):
-            plots.append(claim_plot(analysis, looks))
+        if differences(analysis):
+            plots.append(difference_plot(analysis, looks))
         plots.append(learning_rate(groups, played, looks))
         if any(len(label.seeds) >= FEWEST_RUNS for group in groups for label in group.labels):
             plots.append(profiles(analysis, looks))

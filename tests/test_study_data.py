@@ -1,0 +1,255 @@
+"""The data that a study's encoders are made from: several, by policies, made by several workers."""
+
+import hashlib
+import signal
+import tomllib
+
+import pytest
+from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
+from test_study import TINY
+
+from jbrep.collect.policies import acts_on_observations
+from jbrep.dataset import Dataset
+from jbrep.dataset.manifest import read_manifest
+from jbrep.encoders import load
+from jbrep.errors import InputError
+from jbrep.records.record import to_plain
+from jbrep.rl.shipped import file_of
+from jbrep.study.config import Data, as_study
+from jbrep.study.costs import costs
+from jbrep.study.plan import Plan
+from jbrep.study.prepare import check, prepare
+
+TASK = "face_direction"
+MIXTURE = "uniform:0.4+heuristic:0.3+trained:0.3"
+DATA = {"apart": Data(steps=300), "mixed": Data(steps=600, policy=MIXTURE, seed=40)}
+CODES = (
+    "full",
+    {"name": "pca-4", "data": "apart"},
+    {"name": "late", "kind": "pca", "latent": 4, "data": "mixed", "encoders": 2},
+)
+STUDY = TINY.replace(
+    tasks=(TASK, "move_in_direction"), representations=CODES, data=DATA, episode_steps=100
+)
+
+
+def digests(folder):
+    """What the files are that a study has made, as far as their bytes are its settings' alone."""
+    made = [*folder.rglob("shard-*"), *folder.rglob("*.safetensors")]
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in made
+    }
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A study with two tables of data, prepared by one worker."""
+    plan = Plan(STUDY, tmp_path_factory.mktemp("data") / "one")
+    plan.write()
+    prepare(plan)
+    return plan
+
+
+def test_representations_are_made_from_their_own_data(made):
+    for task in STUDY.tasks:
+        headers = {
+            path.stem: load(path).header for path in made.encoders(task).glob("*.safetensors")
+        }
+        assert headers.keys() == {"full", "pca-4", "late-s0", "late-s1"}
+        seen = {name: header.data["fingerprint"] for name, header in headers.items()}
+        assert seen["full"] == seen["pca-4"]  # the first
+        assert len({*seen.values()}) == 3
+        seeds = {name: header.data["seed"] for name, header in headers.items()}
+        assert seeds == {"full": 0, "pca-4": 0, "late-s0": 40, "late-s1": 41}
+        assert headers["pca-4"].data["policy"]["kind"] == "uniform"
+        assert headers["late-s1"].data["policy"]["kind"] == "mixture"
+        for name, number, table in (("pca-4", 0, "apart"), ("late-s1", 1, "mixed")):
+            manifest = read_manifest(made.data(task, number, table))
+            assert manifest.fingerprint == seen[name]
+
+
+def test_data_hold_what_the_mixture_says(made):
+    for task in STUDY.tasks:
+        folder = made.folder / "data" / "mixed" / task / "set-0"
+        settings = read_manifest(folder).settings
+        assert acts_on_observations(settings.policy)
+        kinds = [part["kind"] for _, part in settings.policy["parts"]]
+        weights = [weight for weight, _ in settings.policy["parts"]]
+        assert kinds == ["uniform", "heuristic", "trained"]
+        assert weights == pytest.approx([0.4, 0.3, 0.3])
+        assert (folder / "policy-0.safetensors").read_bytes() == file_of(task).read_bytes()
+        dataset = Dataset(folder)
+        assert (len(dataset["action"]), dataset.task.name) == (600, task)
+
+
+def test_only_what_does_not_look_is_derived(made):
+    stored = {
+        (name, task): read_manifest(made.data(task, 0, name)).settings.store_state
+        for name in DATA
+        for task in STUDY.tasks
+    }
+    assert stored == {
+        ("apart", TASK): True,
+        ("apart", "move_in_direction"): False,
+        ("mixed", TASK): True,
+        ("mixed", "move_in_direction"): True,
+    }
+
+
+def test_two_workers_make_the_same_bytes(made, tmp_path, capfd):
+    plan = Plan(STUDY, tmp_path / "two")
+    plan.write()
+    prepare(plan, 2)
+    assert digests(plan.folder) == digests(made.folder)
+    lines = capfd.readouterr().err.splitlines()
+    assert "data.mixed of face_direction, set 1: encoder late-s1" in lines
+    assert sum(line.endswith("states") for line in lines) == 6
+    prepare(plan, 2)  # nothing is left to make
+    assert capfd.readouterr().err == ""
+
+
+def test_what_is_stopped_while_it_is_made_goes_on(tmp_path):
+    """To the same bytes: Ctrl-C reaches the workers, which keep what they have."""
+    study = TINY.replace(
+        representations=("full", {"name": "dae-2", "encoders": 2}),
+        data={"": Data(steps=20_000)},
+        training={"epochs": 60},
+    )
+    (tmp_path / "it.toml").write_text(study.toml())
+    stopped, whole = Plan(study, tmp_path / "stopped"), Plan(study, tmp_path / "whole")
+    command = ("study", tmp_path / "it.toml", "--out", stopped.folder, "--workers", 2)
+    process = start(*command)
+    assert wait_for(lambda: list(stopped.folder.rglob("checkpoint.safetensors")), process)
+    workers = workers_of(process.pid)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert (process.returncode, "Traceback" in told) == (128 + signal.SIGINT, False), told
+    assert workers
+    wait_for_the_end_of(workers)
+    assert list(stopped.folder.rglob("checkpoint.safetensors"))
+    prepare(stopped, 2)
+    prepare(whole)
+    assert digests(stopped.folder) == digests(whole.folder)
+
+
+def test_a_mistake_of_a_worker_is_a_line(made, tmp_path):
+    plan = Plan(STUDY, tmp_path / "it")
+    plan.write()
+    for number in range(2):  # in the places of folders
+        path = plan.data(TASK, number, "mixed")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("")
+    with pytest.raises(InputError) as error:
+        prepare(plan, 2)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("data", [DATA, {"": Data(steps=9)}, {"one": Data(steps=9, sets=3)}])
+def test_data_are_written_as_they_are_given(data):
+    name = [*data][-1]
+    of_last = {"name": "dae-8", "data": name} if name else "dae-8"
+    study = TINY.replace(representations=("full", of_last), data=data)
+    given = tomllib.loads(study.toml())
+    assert given["data"] == (
+        {n: each.table for n, each in data.items()} if name else data[""].table
+    )
+    assert as_study(given) == as_study(to_plain(study)) == study
+    assert {key for key in study.flat() if key.startswith("data")} == (
+        {f"data.{n}" for n in data} if name else {"data"}
+    )
+
+
+def test_each_encoder_has_a_data_set_of_its_own_unless_it_is_said_otherwise():
+    many = {"name": "dae-8", "encoders": 4}
+    study = TINY.replace(
+        representations=("full", many, {"name": "mine", "file": "{encoder}", "encoders": 8}),
+        seeds=tuple(range(8)),
+        data={"": Data(steps=9)},
+    )
+    assert study.sets("") == 4
+    assert study.replace(data={"": Data(steps=9, sets=1)}).sets("") == 1
+    assert study.replace(data={"": Data(folder="it")}).sets("") == 1
+
+
+@pytest.mark.parametrize(
+    ("representations", "data", "named"),
+    [
+        (["full", "dae-8"], {"a": {"steps": 9}, "b": {"steps": 9}}, "dae-8: .* one of a, b"),
+        ([{"name": "dae-8", "data": "c"}], {"a": {"steps": 9}}, "dae-8: .*'?c'?: .* a"),
+        ([{"name": "dae-8", "data": "c"}], {"steps": 9}, "dae-8: .* left out"),
+        ([{"name": "dae-8", "data": "c"}], None, r"dae-8 .*\[data\] is missing"),
+        ([{"name": "m", "file": "it", "data": "a"}], {"a": {"steps": 9}}, "m: unknown data"),
+        ([{"name": "m", "code": "my:E", "data": "a"}], {"a": {"steps": 9}}, "m: unknown data"),
+        (["full"], {"a": {"steps": 9}, "b": {"steps": 9}}, r"data\.b is used by no"),
+        ([{"name": "m", "file": "it"}], {"steps": 9}, "data is used by no"),
+        (["full"], {"a": {"steps": 9}, "steps": 9}, "data has steps beside the table a"),
+        (["full"], {"a/b": {"steps": 9}}, "the name of data is 'a/b'"),
+        (["full"], {"a": {"rows": 9}}, r"unknown data\.a\.rows"),
+        (["full"], {"a": {"folder": "it", "policy": "still"}}, "data.a: policy is still"),
+    ],
+)
+def test_mistaken_data_are_refused(representations, data, named):
+    given = {**to_plain(TINY), "representations": representations, "data": data}
+    with pytest.raises(InputError, match=named) as error:
+        as_study(given)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("task", "policy", "named"),
+    [
+        (TASK, "sideways", "data.policy for face_direction: unknown policy 'sideways'"),
+        ("Pendulum-v1", "heuristic", "data.policy for Pendulum-v1: .* no hand-written policy"),
+        ("Pendulum-v1", "trained", "data.policy for Pendulum-v1: no trained policy"),
+    ],
+)
+def test_policies_are_tried_before_anything_is_made(task, policy, named, tmp_path):
+    study = TINY.replace(tasks=(task,), data={"": Data(steps=9, policy=policy)})
+    with pytest.raises(InputError, match=named):
+        check(Plan(study.replace(representations=("full",)), tmp_path / "it"))
+    assert not (tmp_path / "it").exists()
+
+
+def test_named_data_may_come_later_but_not_change(made):
+    Plan(
+        STUDY.replace(
+            representations=(*CODES, {"name": "pca-2", "data": "more"}),
+            data={**DATA, "more": Data(steps=9)},
+        ),
+        made.folder,
+    ).check_folder()
+    other = {**DATA, "mixed": Data(steps=601, policy=MIXTURE, seed=40)}
+    with pytest.raises(InputError, match=r"another study: data\.mixed"):
+        Plan(STUDY.replace(data=other), made.folder).check_folder()
+
+
+def test_what_is_made_first_is_estimated(made, tmp_path):
+    """What is there counts as done, and costs nothing; more steps and epochs cost more."""
+    there = {each.what: each[1:] for each in costs(made)}
+    assert there == {
+        **{"data.apart": (0, 2, 0), "data.mixed": (0, 4, 0)},
+        **{"full": (0, 2, 0), "pca-4": (0, 2, 0), "late": (0, 4, 0)},
+    }
+    codes = ("full", {"name": "dae-2", "encoders": 2})
+    data = {"": Data(steps=200_000, policy=MIXTURE)}
+    study = TINY.replace(representations=codes, training={"epochs": 200}, data=data)
+    large = Plan(study, tmp_path / "none")
+    cost = {each.what: each for each in costs(large)}
+    assert {name: each.to_go for name, each in cost.items()} == {"data": 2, "full": 1, "dae-2": 2}
+    assert min(each.seconds for each in cost.values()) > 0
+    assert cost["data"].seconds > 1
+    assert cost["dae-2"].seconds > 10 * cost["full"].seconds
+    assert not large.folder.exists()
+
+
+def test_a_dry_run_shows_what_is_made_first(tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.study.packing.estimate", lambda runs: 60)
+    study = TINY.replace(data={"": Data(steps=300)})
+    (tmp_path / "it.toml").write_text(study.toml())
+    told = jbrep("study", tmp_path / "it.toml", "--out", tmp_path / "out", "--dry-run")
+    assert told.exit_code == 0, told.output
+    rows = [line.split()[:3] for line in told.stdout.splitlines()]
+    for row in (["data", "1", "0"], ["full", "1", "0"], ["pca-8", "1", "0"]):
+        assert row in rows
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,21 @@
+"""A study's data and encoders, before its agents: python tools/prepare.py STUDY FOLDER."""
+
+import sys
+from pathlib import Path
+
+from jbrep.records.lock import exclusive
+from jbrep.study import Plan, read_study
+from jbrep.study.packing import usual_workers
+from jbrep.study.prepare import check, prepare
+
+
+def main(file: Path, folder: Path) -> None:
+    plan = Plan(read_study(file), folder, file)
+    check(plan)
+    plan.begin()
+    with exclusive(plan.folder):
+        prepare(plan, usual_workers(plan))
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))
