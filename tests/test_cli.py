@@ -134,7 +134,7 @@ def test_folders_of_other_things_are_left_alone(tmp_path):
     for command in (
         ("collect", *short, "--steps", 10),
         ("rl", *short, "--steps", 10),
-        ("study", demo, "--register"),
+        ("study", demo),
         ("behaviour", "heuristic", "--task", "face_direction", "--episodes", 1),
         ("evaluate", "--encoder", "pca-4", "--data", "data/sample/face_direction"),
         ("report", "results/cart-pole"),

@@ -113,17 +113,17 @@ def test_what_is_stopped_while_it_is_made_goes_on(tmp_path):
     """To the same bytes: Ctrl-C reaches the workers, which keep what they have."""
     study = TINY.replace(
         representations=("full", {"name": "dae-2", "encoders": 2}),
-        data={"": Data(steps=20_000)},
-        training={"epochs": 60},
+        data={"": Data(steps=4000)},
+        training={"epochs": 100},
     )
     (tmp_path / "it.toml").write_text(study.toml())
     stopped, whole = Plan(study, tmp_path / "stopped"), Plan(study, tmp_path / "whole")
     command = ("study", tmp_path / "it.toml", "--out", stopped.folder, "--workers", 2)
     process = start(*command)
-    assert wait_for(lambda: list(stopped.folder.rglob("checkpoint.safetensors")), process)
+    assert wait_for(lambda: list(stopped.folder.rglob("checkpoint.safetensors")), process, 400)
     workers = workers_of(process.pid)
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=60)
+    _, told = process.communicate(timeout=120)
     assert (process.returncode, "Traceback" in told) == (128 + signal.SIGINT, False), told
     assert workers
     wait_for_the_end_of(workers)

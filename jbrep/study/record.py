@@ -286,7 +286,7 @@ def _registration(plan: Plan, runs: Collection[RunRecord]) -> RegistrationFacts 
     """When a study was registered, and how what ran differs from that; None if it wasn't."""
     if (found := plan.registration) is None:
         return None
-    deviations = found.deviations(plan.study, runs)
+    deviations = plan.deviations(runs)
     return RegistrationFacts(
         sha256=found.sha256,
         date=found.date,

@@ -131,10 +131,10 @@ def run_study(
         InputError: the folder holds another study, the study's settings can't be used, it isn't
             registered as it must be, or memory doesn't hold as many agents.
     """
-    registered = find_committed(plan.file, plan.study) if plan.file else None
     check(plan)
     workers, unfinished = workers or usual_workers(plan), plan.unfinished
     packed(plan, workers, width)  # so that too little memory shows before anything is written
+    registered = find_committed(plan.file, plan.study) if plan.file else None
     make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
         plan.begin()

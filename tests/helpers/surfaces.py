@@ -27,6 +27,7 @@ from jbrep.dataset.manifest import read_manifest
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.envs.names import environment_versions
+from jbrep.records.document import read_document
 from jbrep.report import make_report
 from jbrep.report.report import STATISTICS, SUMMARY
 from jbrep.report.tables import read_tables
@@ -38,7 +39,7 @@ from jbrep.rl.tune import BEST, SEARCH
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD
-from jbrep.study.registration import REGISTRATION, find_committed, read_registered
+from jbrep.study.registration import REGISTRATION, Registration, find_committed
 from jbrep.study.runner import run_study
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
 
@@ -267,7 +268,7 @@ def _registration():
         command("study", folder / "it.toml", "--register", "--out", folder / "it")
 
     def result(folder):
-        registered = read_registered(folder / f"it.{REGISTRATION}")
+        registered = read_document(folder / f"it.{REGISTRATION}", Registration)
         return registered.study, registered.encoders
 
     def files(folder):
