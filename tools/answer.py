@@ -1,9 +1,11 @@
-"""Studies of one question, each of a task, side by side: python tools/answer.py OUT.png FOLDER ...
+"""The answer of release 0.3, task by task: python tools/answer.py OUT.png FOLDER ...
 
 Prints a table of the tasks and what agents on each representation return in the end, with the
-verdict on *not worse*, and draws all final returns. The tables of the studies are read.
+verdict on *not worse* as it was reached by that release's rules (verdicts.csv), and draws all final
+returns.
 """
 
+import csv
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
@@ -21,12 +23,20 @@ from jbrep.report.figures.style import PAGE, PAPER, reference, styles
 from jbrep.report.tables import read_tables
 from jbrep.report.words import shown
 from jbrep.stats.analysis import GroupAnalysis
-from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, SUPPORTED, Verdict
-from jbrep.stats.labels import YES, RepresentationResult
+from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, SUPPORTED
+from jbrep.stats.labels import RepresentationResult
 
 ORDER = ("coordinates", "symmetry")  # first; the others as their names are
 INSIDE = {CONTRADICTED: "white", SUPPORTED: None}  # of a mean's marker; None as the rest of it
 OPEN = "lightgrey"  # where nothing is decided
+
+
+class Verdict(NamedTuple):
+    """A row of verdicts.csv."""
+
+    verdict: str
+    share: float  # of the baseline's gain; NaN where it has none
+    boundary: float
 
 
 class Judged(NamedTuple):
@@ -51,12 +61,14 @@ def read(folder: Path) -> Judged:
     if analysis is None or len(analysis.groups) != 1:
         raise InputError(f"{folder} isn't a study of one task with comparisons")
     (group,) = analysis.groups
-    verdicts = {
-        each.representation: verdict
-        for each in group.comparisons
-        for verdict in each.verdicts
-        if verdict.claim == NOT_WORSE.name
-    }
+    with (folder / "verdicts.csv").open(newline="") as file:
+        verdicts = {
+            row["representation"]: Verdict(
+                row["verdict"], float(row["estimate"] or "nan"), float(row["boundary"])
+            )
+            for row in csv.DictReader(file)
+            if row["claim"] == NOT_WORSE.name
+        }
     return Judged(group, verdicts)
 
 
@@ -85,9 +97,9 @@ def _cell(study: Judged, name: str) -> str:
     if name not in study.verdicts:
         return returned
     verdict = study.verdicts[name]
-    if study.group.labels[0].learnt != YES or np.isnan(verdict.estimate.value):
+    if np.isnan(verdict.share):
         return f"{returned}, {verdict.verdict}"
-    return f"{returned}, {verdict.estimate.value:.2f}, {verdict.verdict}"
+    return f"{returned}, {verdict.share:.2f}, {verdict.verdict}"
 
 
 def draw(studies: Sequence[Judged]) -> Figure:
@@ -104,7 +116,7 @@ def draw(studies: Sequence[Judged]) -> Figure:
         for row, name in enumerate(names):
             if name in study.labels:
                 _draw_runs(axes, row, study, name, look[name])
-        axes.axvline(study.group.reference, **reference())
+        axes.axvline(study.group.ends.blind, **reference())
         for boundary in {_boundary(study, each) for each in study.verdicts.values()}:
             axes.axvline(boundary, **{**reference(), "linestyle": ":"})
         axes.set_title(study.group.task)
@@ -118,7 +130,8 @@ def draw(studies: Sequence[Judged]) -> Figure:
 def _boundary(study: Judged, verdict: Verdict) -> float:
     """The return at which the share of the gain is on the verdict's boundary."""
     baseline = study.group.labels[0].numbers["final_return_mean"].value
-    return float(study.group.reference + verdict.boundary * (baseline - study.group.reference))
+    blind = study.group.ends.blind
+    return float(blind + verdict.boundary * (baseline - blind))
 
 
 def _draw_runs(axes: Axes, row: int, study: Judged, name: str, style: dict[str, Any]) -> None:

@@ -84,8 +84,8 @@ def cells(known: pd.DataFrame, bounds: Bounds) -> Iterator[tuple[str, str, str]]
     blind = best_blind(by_policy)
     assert blind
     for name in sorted(finals, key=lambda name: (name != BASELINE, name)):
-        pairs = finals[[name, BASELINE]].dropna().to_numpy(float).T  # of the seeds of both
-        share = shown(share_of_gain(*pairs, by_policy[blind], LEVEL), ".2f")
+        x, y = finals[[name, BASELINE]].dropna().to_numpy(float).T  # of the seeds of both
+        share = shown(share_of_gain(x, y, by_policy[blind], LEVEL), ".2f")
         own = finals[name].dropna().to_numpy(float)
         mean = shown(mean_within(own, bounds, LEVEL), ".0f")
         yield name, mean, "" if name == BASELINE else share
