@@ -158,7 +158,13 @@ def test_scores_are_held_against_returns_of_the_same_encoders(tmp_path, capsys, 
     )
     evaluation = SimpleNamespace(
         data=SimpleNamespace(task=FACE),
-        encoders={code: {"rewarded": -finals[code]} for code in codes},
+        encoders={
+            code: SimpleNamespace(
+                latent=int(code.partition("-")[2]),
+                known={"rewarded": -finals[code], "reward": finals[code]},
+            )
+            for code in codes
+        },
         hashes={code: f"hash of {code}" for code in codes},
     )
     rows = [f"{code},hash of {code},trees,{finals[code] ** 2}" for code in codes]
@@ -169,34 +175,36 @@ def test_scores_are_held_against_returns_of_the_same_encoders(tmp_path, capsys, 
     monkeypatch.setattr(worth, "recommended", lambda known: "dae-8")
     monkeypatch.setattr(worth, "read_tables", lambda folder: tables)
     monkeypatch.setattr(worth, "read_document", lambda path, kind: evaluation)
-    monkeypatch.setattr(worth, "headline", lambda known: known)
+    monkeypatch.setattr(worth, "headline", lambda each: each.known)
     worth.main(tmp_path)
     lines = [re.split(" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
     assert lines[2] == ["ranked by", FACE, "mean", "above rewarded", "above a short run"]
-    told = {name: [cell.split()[0] for cell in cells] for name, *cells in lines[3:7]}
+    told = {name: [cell.split()[0] for cell in cells] for name, *cells in lines[3:9]}
     assert told == {
         "rewarded": ["-1.00", "-1.00", "0.00", "0.00"],
+        "reward": ["1.00", "1.00", "2.00", "2.00"],
+        "how many numbers": ["-0.71", "-0.71", "0.29", "0.29"],  # the largest returns least
         "trees": ["1.00", "1.00", "2.00", "2.00"],
         "a short run": ["-1.00", "-1.00", "0.00", "0.00"],
         "a whole run": ["1.00", "1.00", "2.00", "2.00"],
     }
-    assert lines[8][0].endswith("and clearly above both others: it is so")
-    assert lines[12] == ["task", "0 to 0.05", "0.05 to 0.1", "0.1 to 0.2", "0.2 or more"]
-    assert lines[13][1:] == ["0 of 0"] * 3 + ["0 of 10"]
-    assert lines[17][1:] == ["to take", "should serve", "the others", "best of all"]
-    assert lines[18] == [FACE, "dae-8 30", "2: 35", "3: 13", "slow-8 40"]
-    assert lines[22] == ["code", "rewarded", "trees", "a short run", "a whole run", "final return"]
-    assert lines[23] == ["slow-8", "-40", "1,600", "-40", "40", "40"]
-    assert [line[0] for line in lines[23:]] == ["slow-8", "dae-8", "pca-8", "vae-8", "ofe-64"]
+    assert lines[10][0].endswith("and clearly above both others: it is so")
+    assert lines[14] == ["task", "0 to 0.05", "0.05 to 0.1", "0.1 to 0.2", "0.2 or more"]
+    assert lines[15][1:] == ["0 of 0"] * 3 + ["0 of 10"]
+    assert lines[19][1:] == ["to take", "should serve", "the others", "best of all"]
+    assert lines[20] == [FACE, "dae-8 30", "2: 35", "3: 13", "slow-8 40"]
+    assert lines[24] == ["code", *told, "final return"]
+    assert lines[25] == ["slow-8", "-40", "40", "8", "1,600", "-40", "40", "40"]
+    assert [line[0] for line in lines[25:]] == ["slow-8", "dae-8", "pca-8", "vae-8", "ofe-64"]
     for code, value in zip(codes, (0.5, 0.52, 0.58, 0.8, 0.1), strict=True):
-        evaluation.encoders[code]["rewarded"] = value
+        evaluation.encoders[code].known["rewarded"] = value
     worth.main(tmp_path)
     lines = [re.split(" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
-    assert lines[13][1:] == ["1 of 1", "2 of 2", "0 of 0", "7 of 7"]
+    assert lines[15][1:] == ["1 of 1", "2 of 2", "0 of 0", "7 of 7"]
     returns[:] = [r for r in returns if (r.representation, r.seed, r.step) != ("dae-8", 0, 60_000)]
     worth.main(tmp_path)  # of a run that failed before: it counts as -1, above -10 to -40 and -9
     lines = capsys.readouterr().out.splitlines()
-    assert float(lines[5].split()[3]) > -1
+    assert float(lines[7].split()[3]) > -1
     tables.record.missing = {"a run": 7}
     with pytest.raises(InputError, match="a study lacks runs of one task: run the study to its en"):
         worth.main(tmp_path)

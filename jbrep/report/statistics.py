@@ -63,11 +63,14 @@ def results_text(tables: Tables, width: int | None = None, everything: bool = Fa
 def verdict_tables(analysis: Analysis) -> list[Table]:
     """What was registered: a table for each task and algorithm."""
     found = []
-    for group in analysis.groups:
-        rows = [verdict_cells(verdict) for verdict in group.verdicts]
-        if rows:
-            title = f"{group.name}, registered claims"
-            found.append(Table(title, tuple(rows[0]), [tuple(row.values()) for row in rows]))
+    for task, algorithm in dict.fromkeys((v.task, v.algorithm) for v in analysis.verdicts):
+        rows = [
+            verdict_cells(verdict)
+            for verdict in analysis.verdicts
+            if (verdict.task, verdict.algorithm) == (task, algorithm)
+        ]
+        title = f"{task}, {algorithm}, registered claims"
+        found.append(Table(title, tuple(rows[0]), [tuple(row.values()) for row in rows]))
     return found
 
 

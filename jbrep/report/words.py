@@ -53,9 +53,15 @@ def _where(verdict: Verdict, verdicts: Sequence[Verdict]) -> str:
         beside.append(verdict.task)
     if len({each.algorithm for each in verdicts}) > 1:
         beside.append(verdict.algorithm)
-    if verdict.by and verdict.verdict != UNDECIDED:
-        beside.append(f"by {verdict.by:,} steps")
+    if by := _by(verdict):
+        beside.append(by.strip())
     return verdict.sentence + (f" ({', '.join(beside)})" if beside else "")
+
+
+def _by(verdict: Verdict) -> str:
+    """Until when it is so, of what is decided while a curve rises."""
+    is_decided = verdict.verdict != UNDECIDED
+    return f" by {verdict.by:,} steps" if verdict.by and is_decided else ""
 
 
 def verdict_cells(verdict: Verdict) -> dict[str, str]:
@@ -64,7 +70,7 @@ def verdict_cells(verdict: Verdict) -> dict[str, str]:
     score = Interval(*(end / verdict.width for end in interval))
     return {
         "claim": verdict.sentence,
-        "verdict": verdict.verdict + (f" by {verdict.by:,} steps" if verdict.by else ""),
+        "verdict": verdict.verdict + _by(verdict),
         "estimate": told(verdict.claim, interval),
         "score": shown(score, ".2f"),
         "interval": "-" if math.isnan(verdict.level) else _level(verdict),
@@ -109,7 +115,7 @@ def scale_words(group: GroupAnalysis, planned: Planned) -> str:
     if math.isnan(ends.top):
         return f"gains are over {blind}, {shown_number(ends.blind)}"
     named = planned.rules.reference
-    able = named if isinstance(named, str) and named else "" if named else LOOKING
+    able = "" if isinstance(named, float) else named or LOOKING
     one = " ".join(filter(None, (able, shown_number(ends.top))))
     return f"a score of 0 is {blind} {shown_number(ends.blind)}, 1 is {one}"
 

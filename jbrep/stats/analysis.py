@@ -71,17 +71,13 @@ class Analysis:
     seed: int  # of all resampling
     planned: Planned  # what reached the verdicts
     groups: tuple[GroupAnalysis, ...]  # by task and algorithm
+    verdicts: tuple[Verdict, ...]  # on all claims that were registered, by task and algorithm
     aggregates: tuple[Aggregate, ...]  # results across tasks that have scores, of each algorithm
 
     @property
     def baseline(self) -> str:
         """The representation that the others are compared with."""
         return self.planned.rules.baseline
-
-    @property
-    def verdicts(self) -> tuple[Verdict, ...]:
-        """On all claims that were registered."""
-        return tuple(verdict for group in self.groups for verdict in group.verdicts)
 
 
 def analyse(
@@ -118,6 +114,7 @@ def analyse(
         seed=seed,
         planned=planned,
         groups=analysed,
+        verdicts=tuple(verdicts),
         aggregates=tuple(aggregates(_scores(analysed), seed)),
     )
 

@@ -16,6 +16,7 @@ from jbrep.stats.runs import Group, RunCurve
 PERCENTILES = (10, 25, 50, 75, 90)
 _LAST = 0.1  # of the grid's range, for the final return
 _FIFTH = 0.2  # of training, at whose ends it is asked whether curves still rise
+_FLAT = 0.03  # of the final return: a curve that rises by less in a fifth of training is flat
 _POINTS = 64  # of the grid at a time, to keep the resamples in memory
 
 
@@ -175,6 +176,11 @@ def rise(curves: Array, grid: Array) -> Array:
     if not (last.any() and before.any()):
         return np.full(len(curves), np.nan)
     return curves[:, last].mean(axis=1) - curves[:, before].mean(axis=1)
+
+
+def rises(by: Interval, final: float) -> bool:
+    """Whether curves surely rise by so much in the last fifth, and not by a trifle."""
+    return bool(by.low > 0 and by.value >= _FLAT * abs(final))
 
 
 def mean_return(curves: Array, grid: Array) -> Array:

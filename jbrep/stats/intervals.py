@@ -211,7 +211,7 @@ def share_of_gain(x: Array, y: Array, reference: float, level: float) -> Interva
 
     Units are paired. The interval has the shares c for which Student's interval of the mean of
     x - reference - c (y - reference) holds 0 (Fieller 1954). An end is infinite where y may not
-    gain anything; all is NaN where it doesn't.
+    gain anything; all is NaN where it doesn't, and ends are where nothing varies.
     """
     gains = np.stack((x - reference, y - reference))
     of_x, of_y = gains.mean(axis=1)
@@ -221,6 +221,8 @@ def share_of_gain(x: Array, y: Array, reference: float, level: float) -> Interva
     (xx, xy), (_, yy) = quantile**2 * np.cov(gains) / len(x)
     a, b, c = of_y**2 - yy, of_x * of_y - xy, of_x**2 - xx
     value = float(of_x / of_y)
+    if constant(x) and constant(y):
+        return UNDEFINED._replace(value=value)
     if a <= 0:
         return Interval(value, -np.inf, np.inf)
     half = math.sqrt(max(b * b - a * c, 0.0))

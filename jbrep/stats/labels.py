@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import binomtest, iqr, median_abs_deviation
 
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.curves import Curve, bands, final_return, iqm, mean_return, rise, steps_to
+from jbrep.stats.curves import Curve, bands, final_return, iqm, mean_return, rise, rises, steps_to
 from jbrep.stats.intervals import (
     LEVEL,
     UNDEFINED,
@@ -50,7 +50,7 @@ class RepresentationResult:
     @property
     def rises(self) -> bool:
         """Whether returns surely still rise at the end of training."""
-        return bool(self.numbers["rise"].low > 0)
+        return rises(self.numbers["rise"], float(self.numbers["final_return_mean"].value))
 
 
 def describe(
@@ -76,7 +76,7 @@ def describe(
         seeds=tuple(int(run.seed) for run in runs),
         failed=tuple(int(run.seed) for run in runs if run.failed_at is not None),
         encoders=len({run.encoder_seed for run in runs}),
-        learnt=learnt(final, scale.blind, runs[0].bounds),
+        learnt=learnt(of_units(final, encoders), scale.blind, runs[0].bounds),
         curve=bands(curves, seed),
         by_run=by_run,
         numbers={
@@ -111,25 +111,30 @@ def _components(encoders: Units, final: Array) -> dict[str, Interval]:
     return dict(zip(COMPONENTS, found, strict=True))
 
 
-def _mean(values: Array, units: Units, bounds: Bounds) -> Interval:
+def of_units(values: Array, encoders: Units) -> Array:
+    """Numbers of runs, (n,), or their means by encoder, where there are enough."""
+    if len(encoders) < FEWEST_UNITS:
+        return values
+    return np.array([values[runs].mean() for runs in encoders])
+
+
+def _mean(values: Array, encoders: Units, bounds: Bounds) -> Interval:
     """The mean over runs (n,), with its interval over units."""
-    of_units = np.array([values[unit].mean() for unit in units])
-    return unless_few(mean_within(of_units, bounds, LEVEL), len(units))
+    values = of_units(values, encoders)
+    return unless_few(mean_within(values, bounds, LEVEL), len(values))
 
 
 def _numbers(
     by_run: Mapping[str, Array], encoders: Units, bounds: Bounds, seed: int
 ) -> dict[str, Interval]:
-    each_run = [[run] for run in range(len(by_run["final_return"]))]
-    units = encoders if len(encoders) >= FEWEST_UNITS else each_run
     numbers = {}
     for name in ("final_return", "mean_return"):
         values = by_run[name]
-        numbers[f"{name}_mean"] = _mean(values, units, bounds)
+        numbers[f"{name}_mean"] = _mean(values, encoders, bounds)
         numbers[f"{name}_median"] = percentile(median, values, seed=seed)
         numbers[f"{name}_iqm"] = percentile(iqm, values, seed=seed)
     for name in ("gain", "score", "rise"):
-        numbers[name] = _mean(by_run[name], units, Bounds())
+        numbers[name] = _mean(by_run[name], encoders, Bounds())
     final = by_run["final_return"]
     numbers["final_return_sd"] = deviation(final)
     numbers["final_return_iqr"] = percentile(lambda v: iqr(v, axis=-1), final, seed=seed)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.stats.bootstrap import Array
-from jbrep.stats.curves import Compared, compared, final_return, mean_return, rise, steps_to
+from jbrep.stats.curves import Compared, compared, final_return, mean_return, rise, rises, steps_to
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within, surely_above
 from jbrep.stats.runs import Group, evaluated_run, with_failure_returns
 from jbrep.stats.scale import Ends, ends_of
@@ -122,7 +122,10 @@ def paired(known: Compared, x: str, y: str) -> Pair | None:
         steps=float(grid[-1]),
         weights=weights / weights.sum(),
         resolution=_RESOLUTION * max(gain, 0.0) or _RESOLUTION * largest or 1.0,
-        rising=any(mean_within(each.rise, Bounds(), LEVEL).low > 0 for each in sides),
+        rising=any(
+            rises(mean_within(side.rise, Bounds(), LEVEL), float(side.final.mean()))
+            for side in sides
+        ),
         runs=len(shared),
         by_encoder=by_encoder,
     )

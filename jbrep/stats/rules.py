@@ -127,11 +127,6 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
             found.setdefault((x, y), []).append(claim)
         return found
 
-    @property
-    def compared_with(self) -> str:
-        """What the agents that others are compared with see, in words."""
-        return "the full state" if self.baseline == FULL else self.baseline
-
     def baseline_of(self, names: Iterable[str]) -> str:
         """The representation that others are compared with, of some in the order of tables."""
         every = [*names]

@@ -26,12 +26,11 @@ class Ends(NamedTuple):
 
     blind: float  # of the best policy that doesn't look, over which gains are counted
     blind_in_training: float  # the same on the starts of the evaluations during training
-    top: float  # of a policy that can do the task; NaN if none is known
+    top: float  # of a policy that can do the task; NaN if none is known, or above blind
 
     def score(self, returns: Array) -> Array:
         """Returns, or NaN where they have no score."""
-        width = self.top - self.blind
-        return (returns - self.blind) / (width if width > 0 else np.nan)
+        return (returns - self.blind) / (self.top - self.blind)
 
 
 class Scale(NamedTuple):
@@ -68,10 +67,11 @@ def ends_of(compared: Compared) -> Ends:
     top = run.top
     if not compared.on_all_starts and run.top_in_training is not None:
         top = run.top_in_training
+    blind = last if compared.on_all_starts else training
     return Ends(
-        blind=last if compared.on_all_starts else training,
+        blind=blind,
         blind_in_training=training,
-        top=np.nan if top is None else top,
+        top=np.nan if top is None or top <= blind else top,
     )
 
 

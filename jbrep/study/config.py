@@ -305,7 +305,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 )
         without = [task for task in self.tasks if task not in HEURISTICS]
         absolute = all(claim.claim != NOT_WORSE for claim in self.verdicts.stated)
-        if without and not (absolute or self.verdicts.reference):
+        if without and not absolute and self.verdicts.reference == "":
             raise InputError(
                 f"verdicts.claims has {NOT_WORSE.name!r}: name verdicts.reference, a policy or a "
                 f"return that scores 1, as {without[0]} has no hand-written policy"

@@ -218,7 +218,7 @@ def _curves(
             record.draws_of(settings.learner),
             evaluated.get((run.label, run.seed), {}),
             references.get(settings.task, {}),
-            record.planned.rules.reference or LOOKING,
+            LOOKING if record.planned.rules.reference == "" else record.planned.rules.reference,
         )
         for run, settings in ((run, record.settings_of(run)) for run in record.runs)
     ]

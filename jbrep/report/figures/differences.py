@@ -99,7 +99,7 @@ def _name(row: _Row) -> str:
 
 
 def _draw_panel(axes: Axes, rows: list[_Row], look: Styles) -> None:
-    extent = limits([0.0, *(row.estimate.value for row in rows)])
+    extent = limits([0.0, *(each for row in rows for each in (row.estimate.value, row.boundary))])
     axes.set_xlim(extent.with_ends(row.estimate for row in rows).with_room(0.05))
     left, right = axes.get_xlim()
     for place, row in enumerate(rows):
