@@ -8,7 +8,6 @@ from jbrep.stats.bootstrap import Interval
 from jbrep.stats.claims import CONTRADICTED, FASTER, SUPPORTED, UNDECIDED
 from jbrep.stats.power import BETTER_BY, EARLIER_BY, SDS
 from jbrep.stats.rules import Planned, Verdict
-from jbrep.stats.scale import LOOKING
 from jbrep.text import SIGNIFICANT, number
 
 _SHOWN = ", ".join(f"{sd:g}" for sd in SDS)
@@ -54,14 +53,14 @@ def _where(verdict: Verdict, verdicts: Sequence[Verdict]) -> str:
     if len({each.algorithm for each in verdicts}) > 1:
         beside.append(verdict.algorithm)
     if by := _by(verdict):
-        beside.append(by.strip())
+        beside.append(by)
     return verdict.sentence + (f" ({', '.join(beside)})" if beside else "")
 
 
 def _by(verdict: Verdict) -> str:
     """Until when it is so, of what is decided while a curve rises."""
     is_decided = verdict.verdict != UNDECIDED
-    return f" by {verdict.by:,} steps" if verdict.by and is_decided else ""
+    return f"by {verdict.by:,} steps" if verdict.by and is_decided else ""
 
 
 def verdict_cells(verdict: Verdict) -> dict[str, str]:
@@ -70,7 +69,7 @@ def verdict_cells(verdict: Verdict) -> dict[str, str]:
     score = Interval(*(end / verdict.width for end in interval))
     return {
         "claim": verdict.sentence,
-        "verdict": verdict.verdict + _by(verdict),
+        "verdict": " ".join(filter(None, (verdict.verdict, _by(verdict)))),
         "estimate": told(verdict.claim, interval),
         "score": shown(score, ".2f"),
         "interval": "-" if math.isnan(verdict.level) else _level(verdict),
@@ -114,9 +113,8 @@ def scale_words(group: GroupAnalysis, planned: Planned) -> str:
         blind = "an untrained policy" if math.isnan(group.return_floor) else "the least return"
     if math.isnan(ends.top):
         return f"gains are over {blind}, {shown_number(ends.blind)}"
-    named = planned.rules.reference
-    able = "" if isinstance(named, float) else named or LOOKING
-    one = " ".join(filter(None, (able, shown_number(ends.top))))
+    named, top = planned.rules.top, shown_number(ends.top)
+    one = f"{named} {top}" if isinstance(named, str) else top
     return f"a score of 0 is {blind} {shown_number(ends.blind)}, 1 is {one}"
 
 

@@ -33,6 +33,7 @@ from jbrep.stats.claims import (
 from jbrep.stats.intervals import LEVEL, UNDEFINED, unless_few
 from jbrep.stats.pairs import FEWEST_UNITS, Pair, pair_of
 from jbrep.stats.runs import LARGEST_RETURN, Group, Key
+from jbrep.stats.scale import LOOKING
 
 _FIRST = (BETTER.name, NOT_WORSE.name)  # agents that learn nothing vary little
 _SENTENCE = re.compile(rf"(\S+) ({'|'.join(CLAIMS)})(?: than (\S+))?")
@@ -126,6 +127,11 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
         for x, claim, y in self.stated:
             found.setdefault((x, y), []).append(claim)
         return found
+
+    @property
+    def top(self) -> str | float:
+        """What scores 1: the policy or the return that is named, or else the hand-written one."""
+        return LOOKING if self.reference == "" else self.reference
 
     def baseline_of(self, names: Iterable[str]) -> str:
         """The representation that others are compared with, of some in the order of tables."""

@@ -49,7 +49,7 @@ def check(plan: Plan) -> None:
                 check_same(task, Dataset(folder).task, f"the data set {folder}")
                 _check_fits(plan, made, folder)
             else:
-                _tocollect_made(plan, made)
+                _to_collect(plan, made)
         for each in by_name(plan):
             largest = get_method(each.kind).largest(task.size)
             if plan.study.data is None:
@@ -296,13 +296,13 @@ def source_of(plan: Plan, made: Made) -> Made | None:
 
 def collect_made(plan: Plan, made: Made, threads: int | None) -> None:
     """Collect a data set on some threads; None takes one for each core."""
-    folder, (settings, policy) = folder_of(plan, made), _tocollect_made(plan, made)
+    folder, (settings, policy) = folder_of(plan, made), _to_collect(plan, made)
     episodes = usual_shard_episodes(settings, folder, policy)
     settings = settings.replace(shard_episodes=episodes)
     collect(settings, folder, num_threads=threads, policy=policy)
 
 
-def _tocollect_made(plan: Plan, made: Made) -> tuple[DataSettings, Policy]:
+def _to_collect(plan: Plan, made: Made) -> tuple[DataSettings, Policy]:
     """The settings of a data set, with states where the task has them, and its policy."""
     task, policy = plan.task(made.task).undisturbed, _policy(plan, made)
     settings = DataSettings(

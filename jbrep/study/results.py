@@ -28,7 +28,7 @@ from jbrep.rl.files import (
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.curves import common_grid
 from jbrep.stats.runs import groups
-from jbrep.stats.scale import BLIND, LOOKING, best_blind
+from jbrep.stats.scale import BLIND, best_blind
 from jbrep.study.plan import STUDY, read_plan
 from jbrep.study.record import RECORD, LabelSettings, RunFacts, RunsRecord, runs_record
 from jbrep.study.tables import (
@@ -210,7 +210,7 @@ def _curves(
     record: RunsRecord, returns: Iterable[Return], references: References
 ) -> list[RunCurve]:
     """The runs of a study, from its tables."""
-    evaluated = by_run(returns)
+    evaluated, top = by_run(returns), record.planned.rules.top
     return [
         _curve(
             run,
@@ -218,7 +218,7 @@ def _curves(
             record.draws_of(settings.learner),
             evaluated.get((run.label, run.seed), {}),
             references.get(settings.task, {}),
-            LOOKING if record.planned.rules.reference == "" else record.planned.rules.reference,
+            top,
         )
         for run, settings in ((run, record.settings_of(run)) for run in record.runs)
     ]
