@@ -207,8 +207,8 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
     with pytest.raises(InputError, match=r"baseline is 'pca-9': it must be one of .*, full, pca-8"):
         TINY.replace(verdicts=Rules(baseline="pca-9"))
     assert TINY.notices == [
-        "This study is exploratory: its report will give no verdicts, as its file names no cell in "
-        "verdicts.primary.",
+        "This study is exploratory: its report will give no verdicts, as its file has no "
+        "verdicts.claims.",
         "Encoders that ship with jbrep: pca-8. Your own are tables with a file: {name = ..., "
         "file = ...}.",
     ]
@@ -536,7 +536,7 @@ def test_tables_fit_the_terminal(done):
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     path = written(tmp_path)
     out = shutil.copytree(done.folder, tmp_path / "out")
-    shutil.rmtree(next(out.rglob("run.json")).parent)
+    shutil.rmtree(Plan(TINY, out).folder_of(done.cells[0]))
     monkeypatch.setattr("jbrep.study.run_study", lambda *given: 1)
     monkeypatch.setattr("jbrep.report.report.write_report", lambda tables, out: [out])
     told = jbrep("study", path, "--out", out)
@@ -657,17 +657,15 @@ def test_the_runs_below_a_folder_behave_as_one_policy(done):
     np.testing.assert_allclose(after.motor, np.mean([each.motor for each in alone], axis=0))
 
 
-def test_a_run_is_drawn_before_and_after_training_with_the_same_body(done):
+def test_a_run_is_drawn_before_and_after_training_with_the_same_body(done, tmp_path):
     run = done.folder / "runs" / "face_direction" / "a2c" / "full" / "seed-0"
     other = describe("face_direction", {"body": 7}, 100)
     assert find_untrained(run, other).task == find_player(str(run), other).task == other
     task, _ = observe([str(run)], other, 1, 0.5)
     assert task == other
-    train(
-        Run.of(other, "a2c", steps=80, evaluation_episodes=1, preset="paper"), done.folder / "other"
-    )
+    train(Run.of(other, "a2c", steps=80, evaluation_episodes=1, preset="paper"), tmp_path / "other")
     with pytest.raises(InputError, match="with another body or time limit than the policies bef"):
-        observe([str(run), str(done.folder / "other")], None, 1, 0.5)
+        observe([str(run), str(tmp_path / "other")], None, 1, 0.5)
 
 
 def test_tasks_may_come_and_go_whichever_was_collected(tmp_path):

@@ -293,10 +293,8 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     nested = {"name": "random-4", "encoders": 2}
     files = {"name": "mine", "file": "encoders/{task}/mine-{encoder}.safetensors", "encoders": 2}
     own = {"name": "late-4", "kind": "slow", "latent": 4, "lags": [20]}
-    few = {"seeds": (0, 1, 2), "data": {"": Data(folder=str(collected))}}
-    with pytest.raises(InputError, match=r"2 encoders for 3 seeds: .* so give at most 1, or 3"):
-        with_own(nested, files, own, **few)
-    study = with_own(nested, files, own, **(few | {"seeds": (0, 1, 2, 3, 4)}))
+    data = {"": Data(folder=str(collected))}
+    study = with_own(nested, files, own, seeds=(0, 1, 2, 3, 4), data=data)
     assert study.notices[:2] == [
         f"The seeds, 5 in number, share the 2 encoders of {name} unevenly."
         for name in ("random-4", "mine")
