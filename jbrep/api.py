@@ -135,9 +135,6 @@ def collect(
             once.
         retries: how often in a row an environment that fails is made anew and tried again.
         backend: local, or ray for a cluster.
-
-    Raises:
-        InputError: as `jbrep.collect.collector.collect`.
     """
     from jbrep.collect.collector import collect as run
     from jbrep.collect.collector import usual_shard_episodes
@@ -183,10 +180,6 @@ def train_encoder(
         preset: named settings; of dae: authors, its authors' own.
         device: cpu, cuda or auto.
         settings: of the kind, such as latent=8 or on="symmetry".
-
-    Raises:
-        InputError: a setting that the kind doesn't take, or one that is missing; or the file
-            that it would have is another encoder's.
     """
     from jbrep.methods.registry import with_preset
 
@@ -223,9 +216,6 @@ def train_encoders(
         preset: named settings.
         device: cpu, cuda or auto.
         settings: of the kind, for all of them.
-
-    Raises:
-        InputError: as `train_encoder`.
     """
     from jbrep.methods.registry import each_named, with_preset
 
@@ -255,10 +245,6 @@ def evaluate(
         policy: that does the task well; None for the task's hand-written one, if there is one.
         truth: the data set that `data` was derived from, with what it hides.
         agents: whether to find out what small agents return that observe each; see docs/worth.md.
-
-    Raises:
-        InputError: an encoder that isn't one of this task's, or two of one name; or the truth is of
-            another motion; or as `jbrep.worth.check`.
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
@@ -328,7 +314,6 @@ def train(
         settings: of the training: steps, evaluate_every, evaluation_episodes, ...
 
     Raises:
-        InputError: an unknown name, or a value that can't be used; or another run is in the folder.
         StoppedError: `stop` was true.
     """
     from jbrep.envs.description import as_task
@@ -378,9 +363,6 @@ def study(
         workers: processes at a time; None for one for each core.
         width: the most agents that learn together in a process; None for what keeps all busy.
         backend: local, or ray for a cluster.
-
-    Raises:
-        InputError: a study that can't be run, or the folder holds another.
     """
     from jbrep.errors import choose
     from jbrep.study import Plan, run_study
@@ -410,9 +392,6 @@ def report(
         evaluation: folders of evaluations of its encoders, whose diagnostics go into the tables.
         across_trainers: compare runs of different trainers, too.
         out: a folder for the report; None for the study's own.
-
-    Raises:
-        InputError: there is nothing of a study, or a file is damaged.
     """
     from jbrep.records.storage import check_writable, exists
 

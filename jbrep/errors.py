@@ -62,11 +62,7 @@ def refusing(
 
 
 def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:
-    """The choice of that name.
-
-    Raises:
-        InputError: the name is unknown; the message lists the names.
-    """
+    """The choice of that name."""
     if name not in choices:
         raise InputError(f"unknown {what} {name!r}: choose one of {', '.join(choices)}")
     return choices[name]
@@ -82,9 +78,6 @@ def matching(
         names: of all that there is.
         groups: of each of them.
         of: what has them, for the message: "face_direction has no feature".
-
-    Raises:
-        InputError: there is nothing of a name, or that fits a pattern.
     """
     pairs, places = [*zip(names, groups, strict=True)], dict[str, list[int]]()
     for place, pair in enumerate(pairs):

@@ -30,11 +30,7 @@ def prepare_opengl() -> None:
 
 
 def find_opengl() -> None:
-    """Have MuJoCo look for OpenGL; call it before MuJoCo is first imported.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Have MuJoCo look for OpenGL; call it before MuJoCo is first imported."""
     prepare_opengl()
     try:
         import mujoco  # noqa: F401

@@ -184,9 +184,6 @@ def on_cluster(function: Callable[..., Any], cpus: int | None, gpus: int = 0) ->
         function: to run.
         cpus: of the local cluster that is started where RAY_ADDRESS names none; None takes all.
         gpus: that it needs.
-
-    Raises:
-        InputError: no cluster can be reached or started.
     """
     import ray
 

@@ -35,11 +35,7 @@ _MOST_LETTERS = 100  # of what a run calls its representation
 
 
 def check(data: Dataset) -> None:
-    """Check, before anything else takes time, that agents can learn what the data are of.
-
-    Raises:
-        InputError: the environment can't be made, or it gives other rewards.
-    """
+    """Check, before anything else takes time, that agents can learn what the data are of."""
     reason = "gives other rewards" if data.manifest.settings.reward else ""
     try:
         with closing(Lanes(data.task, 1)):
@@ -65,10 +61,6 @@ def add_worth(
         encoders: by label; the full observation is compared with them.
         task: that is learned.
         folder: of the evaluation; the runs are kept there, and go on if they were stopped.
-
-    Raises:
-        InputError: the folder holds other runs; a run failed before there was a return; or as
-            `Run.settings`.
     """
     path = folder / EVALUATION
     with exclusive(path, beside=True):
@@ -103,9 +95,6 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
         encoders: by label, as a run takes them.
         task: that is learned.
         folder: for the runs.
-
-    Raises:
-        InputError: as `add_worth`.
     """
     names = {label: slug(label)[-_MOST_LETTERS:] for label in encoders}
     if len({*names.values()}) < len(names):
@@ -142,11 +131,7 @@ def _trained(jobs: Sequence[Job]) -> dict[Path, RunRecord]:
 def _returns(
     jobs: Sequence[Job], records: Mapping[Path, RunRecord], task: Task
 ) -> dict[Path, Array]:
-    """The last returns of each agent, (20,), by folder; see `learned` for those that failed.
-
-    Raises:
-        InputError: one failed, and there is no return to count.
-    """
+    """The last returns of each agent, (20,), by folder; see `learned` for those that failed."""
     evaluations = {job.folder: read_evaluations(job.folder) for job in jobs}
     least = task.return_floor
     if least is None:

@@ -108,11 +108,7 @@ task_option, needed_task_option = (
 
 
 def needed_task(options: dict[str, Any]) -> "Task":
-    """The task that a command's options name; they are taken out of the options.
-
-    Raises:
-        InputError: there is none; or as `jbrep.envs.describe`.
-    """
+    """The task that a command's options name; they are taken out of the options."""
     name = options.pop("task")
     env, *others = (options.pop(option) for option in _ARGUMENTS)
     others.append(parse_arguments(options.pop("domain", ()), "--domain"))
@@ -131,11 +127,7 @@ def given_task(options: dict[str, Any]) -> "Task | None":
 
 
 def parse_arguments(given: tuple[str, ...], option: str = "--env") -> dict[str, Any]:
-    """Arguments from an option's NAME=VALUE; a value is JSON, or else text.
-
-    Raises:
-        InputError: something else.
-    """
+    """Arguments from an option's NAME=VALUE; a value is JSON, or else text."""
     arguments: dict[str, Any] = {}
     for pair in given:
         name, equals, value = pair.partition("=")

@@ -66,9 +66,6 @@ def checked(options: dict[str, Any]) -> dict[str, Any]:
     Args:
         options: of `needed_task_option`, `environment_options`, `learner_options` and
             `record_options`.
-
-    Raises:
-        InputError: a word is wrong, before anything heavy is imported.
     """
     from jbrep.encoders.shipped import check_found
     from jbrep.envs.names import import_code

@@ -110,11 +110,7 @@ def _shown(key: Key) -> str:
 
 
 def _given(kind: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a method that options give, as text; sizes of the latent as a list.
-
-    Raises:
-        InputError: the method doesn't take one, or needs another.
-    """
+    """The settings of a method that options give, as text; sizes of the latent as a list."""
     from jbrep.methods.registry import METHODS, get_method
 
     method = get_method(kind)

@@ -71,11 +71,6 @@ def collect(
         backend: local, or ray for a cluster.
         policy: in place of the one that the settings name.
         retries: how often in a row an episode in which the environment fails is played again.
-
-    Raises:
-        InputError: invalid settings, a data set of other settings or of more steps in the folder, a
-            shard that is missing or damaged, an environment that isn't what it was, too little disk
-            space, or an environment that fails; the episodes before that are kept.
     """
     policy = policy or make_policy(settings.policy)
     policy.begin(settings.task, [0])  # may refuse the task
@@ -92,11 +87,7 @@ def collect(
 
 
 def _check_environment(folder: Path, num_threads: int | None) -> None:
-    """Play an episode of a data set again.
-
-    Raises:
-        InputError: it differs.
-    """
+    """Play an episode of a data set again."""
     dataset = Dataset(folder)
     if dataset.task.reproducible and any(replay_problems(dataset, 1, num_threads)):
         raise InputError(
@@ -125,9 +116,6 @@ def write_shards(
         check: called with the manifest of what is wanted, where episodes are there already: whether
             they may stay, and others be added to them.
         source: of the data that these are derived from, see `new_manifest`.
-
-    Raises:
-        InputError: as `collect` does.
     """
     make_folder(folder, ("manifest*", "shard-*", "policy-*"))
     with exclusive(folder):
@@ -198,11 +186,7 @@ class _Writing:
         self._committed = time.monotonic()
 
     def add(self, columns: Columns) -> None:
-        """Hold the episodes that aren't there and are needed.
-
-        Raises:
-            InputError: there are as many shards as there can be.
-        """
+        """Hold the episodes that aren't there and are needed."""
         manifest = self.remaining.manifest
         first = manifest.episodes + sum(len(each[_LENGTH]) for each in self._held)
         if first // manifest.settings.shard_episodes >= _MAX_SHARDS:
@@ -324,10 +308,6 @@ def usual_shard_episodes(
     A batch's shards have 100,000 steps, each with all threads; other environments' 20,000, since
     they are made side by side. A data set that is there already keeps its own number. Where no
     episode can be played again, a robot may exist once: none is played for this.
-
-    Raises:
-        InputError: the manifest in the folder can't be read, or the environment fails more than
-            `retries` times in a row.
     """
     if exists(folder / MANIFEST):
         return read_manifest(folder).settings.shard_episodes

@@ -49,10 +49,6 @@ def derive(
         folder: where to write; an unfinished derivation is resumed.
         store_state: store the states as well.
         num_threads: threads to use; None takes one for each core.
-
-    Raises:
-        InputError: the source has no states, is unfinished or damaged, was collected by a policy
-            that depends on observations or with other versions; or as `collect` does.
     """
     dataset = Dataset(source)
     settings = dataset.manifest.settings
@@ -104,8 +100,6 @@ def derive_view(
             empty.
 
     Raises:
-        InputError: the source is unfinished or was made with other versions, the folder holds what
-            was derived from other data; or as `with_view`, `reward_function` or `collect`.
         DamageError: the file of a policy that acted in it is damaged or missing.
     """
     dataset = Dataset(source)

@@ -34,11 +34,7 @@ class Policy(Protocol):
         """What determines it, as plain JSON: its kind and its constants."""
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        """Act in n new episodes with these seeds; what is drawn depends on each one's alone.
-
-        Raises:
-            InputError: it can't act in this task.
-        """
+        """Act in n new episodes with these seeds; what is drawn depends on each one's alone."""
 
 
 def generators(task: Task, seeds: Sequence[int]) -> list[np.random.Generator]:
@@ -182,11 +178,7 @@ class Mixture:
         return {"kind": MIXTURE, "parts": [[w, policy.settings()] for w, policy in self.parts]}
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        """Act with the part that is drawn for each episode.
-
-        Raises:
-            InputError: a part can't act in this task.
-        """
+        """Act with the part that is drawn for each episode."""
         weights = [weight for weight, _ in self.parts]
         drawn = np.array([episode_part(seed, weights) for seed in seeds], int)
         actors: list[tuple[NDArray[np.intp], Actor]] = []
@@ -216,9 +208,6 @@ def parse_policy(text: str, other: Callable[[str], Policy | None] = lambda text:
     Args:
         text: a policy, or parts of a mixture with their weights.
         other: the policy that text stands for which is none of POLICIES; None if there is none.
-
-    Raises:
-        InputError: as `make_policy` does.
     """
     if policy := other(text):
         return policy
@@ -273,9 +262,6 @@ def make_policy(
     Args:
         settings: its kind and constants.
         trained: makes those of runs, which need more than their settings.
-
-    Raises:
-        InputError: an unknown policy, an unknown constant, or one out of range.
     """
     if settings["kind"] == TRAINED:
         return trained(settings)

@@ -50,11 +50,6 @@ def repair(
 
     Yields:
         A line for each file restored or renamed.
-
-    Raises:
-        InputError: there is no data set, or a shard comes out differently here, as it does if
-            another machine or other versions made it, or the data set was imported; or the file of
-            a policy that acted in it is damaged or missing.
     """
     check_counts(lanes, num_threads)
     intact = _intact_manifest(folder)

@@ -30,10 +30,6 @@ def replay_problems(
 
     Yields:
         A line for each episode that differs.
-
-    Raises:
-        InputError: there are fewer episodes, the environment isn't reproducible, or the data set
-            was imported.
     """
     total = len(dataset.episodes["length"])
     if not 0 <= episodes <= total:
@@ -83,9 +79,6 @@ def simulate_again(
         read: what to record besides observations and rewards.
         tick: called after each step.
         num_threads: threads to step a batch on; None takes one for each core.
-
-    Raises:
-        InputError: the data set was imported, or its environment can't be made.
     """
     dataset = episodes[0].dataset
     if dataset.manifest.settings.is_imported:

@@ -69,11 +69,7 @@ class Made(NamedTuple):
 
 
 def all_of(made: Made) -> Iterator[Columns]:
-    """What was made, and then the failure.
-
-    Raises:
-        InputError: there is one.
-    """
+    """What was made, and then the failure."""
     if made.columns is not None:
         yield made.columns
     if made.failure:

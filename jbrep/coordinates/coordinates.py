@@ -35,7 +35,6 @@ class Part(Record, frozen=True, array_like=True):
     soft: _Soft = 0.0  # length at which a polar coordinate leaves its corner
 
     def check(self) -> None:
-        """As for `Record`."""
         if len(self.of) != self._formula.takes:
             raise InputError(
                 f"{self.name}, {self.formula}, takes {self._formula.takes} numbers, but is given "
@@ -85,9 +84,6 @@ class Coordinates:
         task, parts: as given.
         names: of all coordinates, in order.
         sources: the part that each coordinate is of, by name.
-
-    Raises:
-        InputError: a part takes what isn't known, or two give the same.
     """
 
     def __init__(self, task: Task, parts: tuple[Part, ...]):

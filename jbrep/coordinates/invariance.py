@@ -25,11 +25,7 @@ _SHIFT = (0.5, -0.25)  # [m]
 def tried_coordinates(
     task: Task, system: System, leave_out: Collection[Ingredient] = ()
 ) -> Coordinates | None:
-    """As `make_coordinates`, but symmetry is tried out.
-
-    Raises:
-        InputError: as `make_coordinates` and `check_invariant`.
-    """
+    """As `make_coordinates`, but symmetry is tried out."""
     made = make_coordinates(task, system, leave_out)
     if made and system == "symmetry":
         check_invariant(made)
@@ -42,9 +38,6 @@ def check_invariant(coordinates: Coordinates) -> None:
     Two robots are played alike; then one of them is turned by a quarter and, if the task has points
     in the world, shifted, with the targets that the environment moves along. Their episodes must
     end alike, too. Where all rewards were the same, a notice says that they tell nothing.
-
-    Raises:
-        InputError: they change, or it can't be tried.
     """
     task = coordinates.task
     with refusing(f"symmetry can't be tried on {task.name}", told=reason), aside():

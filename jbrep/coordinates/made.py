@@ -35,10 +35,6 @@ def make_coordinates(
 
     Returns:
         The coordinates; None for the observation itself.
-
-    Raises:
-        InputError: the task's features don't allow them; or an ingredient that is needed or that
-            isn't there is left out.
     """
     if leave_out and system in (OBSERVATION, "angles"):
         raise InputError(f"nothing can be left out of {system}: give coordinates or symmetry")
@@ -69,9 +65,6 @@ class _Maker:
         task: whose features they are made of.
         used: ingredients.
         invariant: whether to leave out what shifting and turning the world changes.
-
-    Raises:
-        InputError: the task has no attitude, or several, where one is needed.
     """
 
     def __init__(self, task: Task, used: Collection[str], invariant: bool):

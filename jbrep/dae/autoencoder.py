@@ -40,13 +40,11 @@ class Autoencoder(Network, Reconstructing, frozen=True, kw_only=True):
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
-        """As for `Method`."""
         used = get_architecture(given.get("architecture", _PAPER.name))
         own = {"epochs": used.epochs, "learning_rate": used.learning_rate}
         return {**super().defaults(), **own}
 
     def objective(self, data: ScaledDataset) -> "Reconstruction":
-        """As for `Learned`."""
         return Reconstruction(self, data.size, feature_weights(data, self.weights))
 
 
@@ -68,13 +66,11 @@ class DAE(Autoencoder, frozen=True, kw_only=True):
     shared_noise: Annotated[bool, Meta(description="Corrupt all rows of a batch alike.")] = False
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         super().check_data(data)
         if not self.noise:
             raise InputError("dae without noise is a plain autoencoder: use the kind ae")
 
     def objective(self, data: ScaledDataset) -> "Reconstruction":
-        """As for `Learned`."""
         weights = feature_weights(data, self.weights)
         return Reconstruction(self, data.size, weights, self.noise, self.shared_noise)
 
@@ -133,13 +129,11 @@ class Reconstruction(Objective):
         return clean + drawn if self._shared else drawn.add_(clean)
 
     def loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
-        """As for `Objective`."""
         corrupted, clean = batch
         squares = (self.decoder(self.encoder(corrupted.T)) - clean.T).square()
         return (squares if self._weights is None else squares * self._weights).mean()
 
     def gradient(self, batch: tuple[Tensor, Tensor]) -> Tensor:
-        """As for `Objective`, written out."""
         corrupted, clean = batch
         rows = corrupted.shape[1]
         if self._gradient is None or self._gradient.rows < rows:
@@ -152,5 +146,4 @@ class Reconstruction(Objective):
         return super().rate(progress, step) if self._decays else 1
 
     def layers(self) -> tuple[Layers, Layers]:
-        """As for `Objective`."""
         return layers(self.encoder), layers(self.decoder)

@@ -136,9 +136,6 @@ class Batches:
         size: rows per batch; the last of a pass may be smaller.
         seed: of the order.
         memory: limit of the rows held in memory [bytes].
-
-    Raises:
-        InputError: `size` is below 1, or `seed` below 0.
     """
 
     _RUN = 1024  # consecutive rows read together if they don't all fit

@@ -165,9 +165,6 @@ def new_manifest(settings: DataSettings, source: Manifest | None = None) -> Mani
         settings: of the data set.
         source: of the data that it is derived from, which know the versions of the environment:
             that need not be here then.
-
-    Raises:
-        InputError: the environment isn't here.
     """
     from importlib.metadata import version  # slow to import, and readers don't need it
 
@@ -185,7 +182,6 @@ def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
     """Read the manifest of a data set, or its backup, and check every byte of it.
 
     Raises:
-        InputError: there is no data set, or it has another version of the format.
         DamageError: it isn't what jbrep wrote.
     """
     path = folder / name
@@ -347,9 +343,6 @@ def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
 
     Returns:
         The manifest that names them, too.
-
-    Raises:
-        InputError: they can't be written.
     """
     shard = manifest.full_shards
     if shard < len(manifest.shards):
@@ -363,11 +356,7 @@ def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
 
 
 def write_shard(folder: Path, manifest: Manifest, shard: int, columns: Columns) -> Entry:
-    """Write a shard's file; it counts once a manifest names it.
-
-    Raises:
-        InputError: it can't be written.
-    """
+    """Write a shard's file; it counts once a manifest names it."""
     entry, image = _entry_and_image(manifest, shard, columns)
     write_whole(folder / shard_name(shard), image)
     return entry
@@ -385,10 +374,6 @@ def _entry_and_image(manifest: Manifest, shard: int, columns: Columns) -> tuple[
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write the backup, then the manifest, in place of the previous ones.
-
-    Raises:
-        InputError: it can't be written.
-    """
+    """Write the backup, then the manifest, in place of the previous ones."""
     for name in (BACKUP, MANIFEST):
         manifest.write(folder / name)

@@ -88,7 +88,6 @@ class Dataset:
         task: the task whose features the observations hold.
 
     Raises:
-        InputError: there is no data set.
         DamageError: a file is damaged, missing or not part of the data set; also later, when
             rows of a damaged shard are read.
     """
@@ -142,9 +141,6 @@ class Dataset:
 
         Returns:
             The data set.
-
-        Raises:
-            InputError: the folder exists already, or the arrays can't be used.
         """
         from jbrep.dataset.formats.flat import source_of  # imports Gymnasium
 
@@ -175,9 +171,6 @@ class Dataset:
 
         Returns:
             The data set.
-
-        Raises:
-            InputError: the folder exists already, or the table can't be used.
         """
         from jbrep.dataset.formats.arrow import table_of
         from jbrep.dataset.formats.logs import source_of_table
@@ -208,7 +201,6 @@ class Dataset:
             The data set.
 
         Raises:
-            InputError: the folder exists already, or the files can't be used.
             ModuleNotFoundError: their format needs a package that isn't installed.
         """
         from jbrep.dataset.formats import open_sources
@@ -297,11 +289,7 @@ class Dataset:
         return episode_bounds(self.episodes["length"])
 
     def episode(self, number: int) -> Episode:
-        """One episode: its rows, its part of each column, and what is stored once for it.
-
-        Raises:
-            InputError: there is no such episode.
-        """
+        """One episode: its rows, its part of each column, and what is stored once for it."""
         count = len(self.episodes["length"])
         if not 0 <= number < count:
             raise InputError(
@@ -316,9 +304,6 @@ class Dataset:
         Args:
             test: share of the episodes to hold out, in (0, 1); at least one is held out.
             seed: of the draw.
-
-        Raises:
-            InputError: fewer than two episodes, or a share out of range.
         """
         lengths = self.episodes["length"]
         held_out = np.zeros(len(lengths), dtype=bool)
@@ -327,11 +312,7 @@ class Dataset:
         return Split(np.flatnonzero(~is_test), np.flatnonzero(is_test))
 
     def split_episodes(self, test: float = 0.2, seed: int = 0) -> Split:
-        """The same split as `split`, by the numbers of the episodes, sorted.
-
-        Raises:
-            InputError: likewise.
-        """
+        """The same split as `split`, by the numbers of the episodes, sorted."""
         if not 0 < test < 1:
             raise InputError(f"the share to hold out is {test}: it must be between 0 and 1")
         number = len(self.episodes["length"])

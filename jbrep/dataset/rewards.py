@@ -21,10 +21,6 @@ def reward_function(code: str) -> Callable[[Array, Array], NDArray[np.float64]]:
 
     Args:
         code: module:function, the module of which has been imported on request.
-
-    Raises:
-        InputError: there is none of the name. The function raises it if it fails, or gives another
-            shape or a number that isn't finite in 32 bits.
     """
     function = code_named(code, "reward")
 
@@ -52,11 +48,7 @@ def reward_function(code: str) -> Callable[[Array, Array], NDArray[np.float64]]:
 
 
 def with_hash(code: str) -> str:
-    """The name of such a function, and the hash of its code: data of two codes don't go together.
-
-    Raises:
-        InputError: as `reward_function`.
-    """
+    """The name of such a function with the hash of its code, as data of two codes differ."""
     parts = sorted(code_behind(code_named(code, "reward")).items())
     return f"{code} {hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]}"
 

@@ -42,9 +42,6 @@ class ScaledDataset:
         scaler: fitted to the training rows only.
         scaling: how, a key of jbrep.dataset.scaling.SCALINGS.
         used: places of the scaled numbers that a row has; all of them unless some are left out.
-
-    Raises:
-        InputError: fewer than two episodes, or numbers that aren't finite.
     """
 
     def __init__(self, dataset: Dataset):
@@ -65,11 +62,7 @@ class ScaledDataset:
 
     @classmethod
     def of(cls, data: "ScaledDataset | Dataset | str | Path") -> "ScaledDataset":
-        """What a user gives as data: it may be a data set, or its folder.
-
-        Raises:
-            InputError: as `Dataset` and `ScaledDataset`.
-        """
+        """What a user gives as data: it may be a data set, or its folder."""
         if isinstance(data, ScaledDataset):
             return data
         return cls(data if isinstance(data, Dataset) else Dataset(data))
@@ -88,9 +81,6 @@ class ScaledDataset:
             coordinates: of the observations, in their place; None for these themselves.
             clip: scaled values stay within [-clip, clip]; None for no limit.
             without: features or coordinates that rows don't have, or groups of such coordinates.
-
-        Raises:
-            InputError: the task has no usual ranges, or no such feature.
         """
         other = copy(self)
         for found in ("moments", "constant_features"):

@@ -74,11 +74,7 @@ class Scaler:
         return self.coordinates.sources if self.coordinates else task.feature_names
 
     def places(self, names: Iterable[str], task: Task) -> list[int]:
-        """Places of the scaled numbers with these names, or of parts with these, or patterns.
-
-        Raises:
-            InputError: there are none of a name.
-        """
+        """Places of the scaled numbers with these names, or of parts with these, or patterns."""
         own = [each.name for each in self.features(task)]
         return sorted(matching(names, own, self.parts(task), f"{task.name} has no feature"))
 
@@ -114,9 +110,6 @@ def fit_scaler(
         rows: that it is fitted to.
         coordinates: of the observations; None for these themselves.
         clip: scaled values stay within [-clip, clip]; None for no limit.
-
-    Raises:
-        InputError: the task has no usual range of a feature, where that is needed.
     """
     low, high = SCALINGS[scaling](_Values(task, column, coordinates), rows)
     return Scaler(low.astype(np.float32), high.astype(np.float32), coordinates, clip)

@@ -53,11 +53,7 @@ def _spec(dtype: str, *row: int, follows: Callable[[Columns], NDArray[Any]] | No
 def _specs(
     task: Task, store_state: bool, weights: Sequence[float], unrewarded: bool
 ) -> dict[str, Spec]:
-    """The columns of each shard, by their paths in the file.
-
-    Raises:
-        InputError: an array of the task's states has the name of another column.
-    """
+    """The columns of each shard, by their paths in the file."""
 
     def steps_of(known: Columns) -> NDArray[Any]:
         rows, firsts = len(known["action"]), episode_bounds(known[length])[:-1]
@@ -110,13 +106,7 @@ def _specs(
 
 
 class DataSettings(CollectSettings, frozen=True, kw_only=True):
-    """What determines the data, and how they are divided into shards.
-
-    Raises:
-        InputError: a field that doesn't fit; a task whose arrays have the names of other columns,
-            or without states that are to be stored, or with a domain; a seed that is too large for
-            it.
-    """
+    """What determines the data, and how they are divided into shards."""
 
     task: Task = msgspec.field(name="environment")
     policy: PolicySettings = msgspec.field(default_factory=lambda: {"kind": "uniform"})
@@ -124,7 +114,6 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
     reward: _Code | UnsetType = UNSET  # what has given the rewards, if not the environment
 
     def check(self) -> None:
-        """As for `Record`."""
         check_policy(self.policy)
         self.specs()
         episode_seed(self.task, self.seed, (self.steps - 1) // self.task.max_episode_steps)
@@ -213,9 +202,6 @@ def episode_seed(task: Task, root: int, episode: int) -> int:
     and none is as small as the seeds that people choose. `env.reset(seed=...)` with it starts
     the same episode. For an environment that takes seeds of 31 bits only, it is
     (root + 1) * 2**20 + episode.
-
-    Raises:
-        InputError: a root or an episode beyond what such an environment can have.
     """
     bits = _EPISODE_BITS[task.seed_bits]
     seed = ((root + 1) << bits) + episode

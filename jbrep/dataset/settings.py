@@ -63,7 +63,6 @@ class _Mixture(Record, frozen=True, kw_only=True):
     ]
 
     def check(self) -> None:
-        """As for `Record`."""
         for _, part in self.parts:
             check_policy(part)
             if part["kind"] == MIXTURE:
@@ -83,11 +82,7 @@ class _Trained(Record, frozen=True, kw_only=True):
 
 
 def check_policy(policy: Mapping[str, Any]) -> None:
-    """Make sure that a policy is a kind and constants that fit it: numbers and short text.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """Make sure that a policy is a kind and constants that fit it: numbers and short text."""
     kind = policy.get("kind")
     converted(kind, _Kind, "the kind of a policy")
     converted(policy, {MIXTURE: _Mixture, TRAINED: _Trained}.get(str(kind), _Constants), "policy")

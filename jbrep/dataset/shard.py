@@ -65,7 +65,6 @@ def map_file(path: Path) -> mmap.mmap:
 
     Raises:
         DamageError: there is no such file, or it is empty or not a regular file.
-        InputError: it can't be read.
     """
     try:
         if (file := open_regular(path)) is not None:

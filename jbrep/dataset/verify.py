@@ -35,9 +35,6 @@ def find_problems(folder: Path) -> Iterator[str]:
 
     Yields:
         A line for each problem.
-
-    Raises:
-        InputError: there is no data set.
     """
     files = hdf5_files(folder)
     try:

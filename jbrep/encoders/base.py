@@ -68,18 +68,10 @@ class BaseEncoder(ABC):
 
     @abstractmethod
     def decode(self, latent: Any) -> Any:
-        """Decode latents (..., l) to observations (..., d) in physical units.
-
-        Raises:
-            InputError: it can't.
-        """
+        """Decode latents (..., l) to observations (..., d) in physical units."""
 
     def check_decodes(self, why: str) -> None:
-        """Make sure that it can decode, where that is needed.
-
-        Raises:
-            InputError: it can't; the message says why that matters.
-        """
+        """Make sure that it can decode, where that is needed."""
         if not self.can_decode:
             raise InputError(f"{self.name} has no decoder: {why}")
 
@@ -89,11 +81,7 @@ class BaseEncoder(ABC):
 
     @abstractmethod
     def check_task(self, task: Task) -> None:
-        """Make sure that it can read this task's observations.
-
-        Raises:
-            InputError: it was made for another environment or other features.
-        """
+        """Make sure that it can read this task's observations."""
 
 
 def as_encoder(given: Any, task: Task) -> BaseEncoder:
@@ -103,9 +91,6 @@ def as_encoder(given: Any, task: Task) -> BaseEncoder:
         given: an encoder of jbrep; an object with `encode`, or any function; a torch module; or a
             fitted transformer of scikit-learn.
         task: whose observations it is to read.
-
-    Raises:
-        InputError: it was made for another task, or as `OwnEncoder`.
     """
     encoder = given if isinstance(given, BaseEncoder) else OwnEncoder(given, task)
     encoder.check_task(task)
@@ -129,11 +114,6 @@ class OwnEncoder(BaseEncoder):
 
     Attributes:
         given: the user's object.
-
-    Raises:
-        InputError: it can't be called, fails, or returns something else than finite latents of one
-            size, which is its `latent_size` if it has one; or other latents for the same
-            observation, the next time or in another batch.
     """
 
     kind = OWN
@@ -193,15 +173,9 @@ class OwnEncoder(BaseEncoder):
                 )
 
     def encode(self, observation: Any) -> Float32:
-        """As for `BaseEncoder`, with NumPy arrays.
-
-        Raises:
-            InputError: observations of another length, or as for the class.
-        """
         return self._in_rows(self._encode, observation, self.size, self.latent_size)
 
     def decode(self, latent: Any) -> Float32:
-        """As for `BaseEncoder`, with NumPy arrays."""
         self.check_decodes("it can't reconstruct observations")
         return self._in_rows(self._decode, latent, self.latent_size, self.size)
 

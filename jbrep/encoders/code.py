@@ -11,12 +11,7 @@ from jbrep.errors import refusing
 
 
 def make(name: str | Path, task: Task) -> BaseEncoder:
-    """The encoder that code names: a class, or a function of no arguments, is called to make it.
-
-    Raises:
-        InputError: its module wasn't imported on request, it has no such name, the call fails, or
-            as `as_encoder`.
-    """
+    """The encoder that code names: a class, or a function of no arguments, is called to make it."""
     with refusing(f"can't make the encoder {name}"):
         thing = code_named(str(name), "encoder")
         if _makes(thing):

@@ -78,10 +78,6 @@ class Encoder(BaseEncoder):
         scaler, encoder, decoder: as given.
         kept: places of the scaled numbers that pass around the layers.
         arrays: what it computes with, in NumPy.
-
-    Raises:
-        InputError: tensors whose shapes are inconsistent, whose type is not float32, or that hold
-            numbers that are not finite; an unknown activation. The message names the tensor.
     """
 
     def __init__(
@@ -143,9 +139,6 @@ class Encoder(BaseEncoder):
             decoder: takes latents, gives observations; its method `decode` is used if it has one.
                 None for the `decode` of the encoder, or none.
             name: what tables will call it: lower-case letters, digits and hyphens.
-
-        Raises:
-            InputError: a module is no such chain; the message names the operation.
         """
         from jbrep.encoders.from_torch import layers_of  # imports torch
         from jbrep.envs.description import as_task  # imports Gymnasium
@@ -171,9 +164,6 @@ class Encoder(BaseEncoder):
 
         A torch tensor gives a tensor on the same device, and gradients flow through; anything else
         is converted to a NumPy array.
-
-        Raises:
-            InputError: observations of another length.
         """
         values, arrays = self._prepare(observation, self.size, "observations")
         return arrays.encode(values)
@@ -181,11 +171,7 @@ class Encoder(BaseEncoder):
     __call__ = encode
 
     def decode(self, latent: Values) -> Values:
-        """Decode latents (..., l) to reconstructed observations (..., d) in physical units.
-
-        Raises:
-            InputError: latents of another length, or there is no decoder.
-        """
+        """Decode latents (..., l) to reconstructed observations (..., d) in physical units."""
         self.check_decodes("it can't reconstruct observations")
         values, arrays = self._prepare(latent, self.latent_size, "latents")
         return arrays.decode(values)
@@ -227,11 +213,9 @@ class Encoder(BaseEncoder):
 
     @property
     def not_decoded(self) -> tuple[str, ...]:
-        """As for `BaseEncoder`."""
         return self.scaler.coordinates.not_decoded if self.scaler.coordinates else ()
 
     def comparable(self, decoded: Any, observation: Any) -> Any:
-        """As for `BaseEncoder`."""
         on_coordinates = self.scaler.coordinates is not None
         return nearest(self.task, decoded, observation) if on_coordinates else decoded
 
@@ -250,11 +234,7 @@ def _check_layer(name: str, layer: Layer, inputs: int) -> int:
 
 
 def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...]) -> None:
-    """Make sure that a tensor is of that shape, of float32, and finite.
-
-    Raises:
-        InputError: it isn't.
-    """
+    """Make sure that a tensor is of that shape, of float32, and finite."""
     if tensor.shape != shape:
         raise InputError(f"tensor {name} has shape {tensor.shape}, expected {shape}")
     if tensor.dtype != np.float32:
@@ -274,9 +254,6 @@ def imported(task: Task, name: str, encoder: Layers, decoder: Layers, package: s
         encoder: from d features to l units.
         decoder: from l units to d features; empty if there is none.
         package: that it comes from, such as torch.
-
-    Raises:
-        InputError: an invalid name, or as `Encoder`.
     """
     versions = {each: version(each) for each in ("jbrep", "numpy", package)}
     header = EncoderHeader(kind=IMPORTED, name=name, environment=task, versions=versions)

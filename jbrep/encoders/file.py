@@ -20,20 +20,12 @@ SUFFIX = ".safetensors"
 
 
 def save(encoder: Encoder, path: Path) -> None:
-    """Write an encoder's file, whole or not at all.
-
-    Raises:
-        InputError: it can't be written, or `load` would refuse it.
-    """
+    """Write an encoder's file, whole or not at all."""
     write_whole(path, _packed(encoder, path))
 
 
 def save_new(encoder: Encoder, path: Path) -> None:
-    """The same of a file that doesn't exist yet.
-
-    Raises:
-        InputError: as `save`; or it exists, or another process is writing it.
-    """
+    """The same of a file that doesn't exist yet."""
     make_folder(path.parent)
     write_new(path, _packed(encoder, path))
 
@@ -54,8 +46,6 @@ def load(path: Path) -> Encoder:
     """Read an encoder's file.
 
     Raises:
-        InputError: no such file, another kind of file, one of another version of the format, or one
-            whose header and tensors are inconsistent; the message names the tensor.
         DamageError: it isn't what was written.
     """
     return unpack(path, *container.read(path, "encoder"))
@@ -68,9 +58,6 @@ def unpack(path: Path, tensors: Tensors, header: dict[str, Any]) -> Encoder:
         path: of the file that they come from, for messages.
         tensors: as `Encoder.tensors` gives them.
         header: as `EncoderHeader.as_json` gives it.
-
-    Raises:
-        InputError, DamageError: as `load`.
     """
     known = document_from(header, path, EncoderHeader)
     try:

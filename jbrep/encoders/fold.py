@@ -43,9 +43,6 @@ class Chain:
         Args:
             weight: (out, in).
             bias: (out,), or one number.
-
-        Raises:
-            InputError: other shapes.
         """
         weight, bias = np.asarray(weight, np.float64), np.asarray(bias, np.float64)
         if weight.ndim != 2 or not weight.size:
@@ -62,21 +59,13 @@ class Chain:
         return Chain(outputs, self.ended, (weight, bias))
 
     def scale(self, factor: Any, shift: Any = 0) -> "Chain":
-        """Add values * factor + shift, each (width,) or one number.
-
-        Raises:
-            InputError: other shapes.
-        """
+        """Add values * factor + shift, each (width,) or one number."""
         factor, shift = (_row(np.asarray(v, np.float64), self.width) for v in (factor, shift))
         weight, bias = self._affine()
         return Chain(self.width, self.ended, (weight * factor[:, None], bias * factor + shift))
 
     def activate(self, name: str) -> "Chain":
-        """Add an activation, which ends a layer.
-
-        Raises:
-            InputError: the layers become too large.
-        """
+        """Add an activation, which ends a layer."""
         weight, bias = self._affine()
         if sum(layer.weight.size for layer in self.ended) + weight.size > _MOST_NUMBERS:
             raise InputError(f"its layers have more than {_MOST_NUMBERS:,} numbers")
@@ -91,9 +80,6 @@ class Chain:
 
         With another epsilon than an encoder's it is the same one of values that are scaled: both
         then divide by the same number.
-
-        Raises:
-            InputError: an epsilon that is no positive number.
         """
         if not 0 < epsilon < math.inf:
             raise InputError(f"its epsilon is {epsilon}: it must be positive")
@@ -101,11 +87,7 @@ class Chain:
         return scaled.activate(LAYER_NORM)
 
     def layers(self) -> tuple[Layer, ...]:
-        """All layers.
-
-        Raises:
-            InputError: there are none, since it leaves values as they are.
-        """
+        """All layers."""
         if self.last:
             weight, bias = self.last
             if len(bias) != weight.shape[1] or bias.any() or (weight != np.eye(len(bias))).any():
@@ -116,11 +98,7 @@ class Chain:
 
 
 def _row(values: Array, width: int) -> Array:
-    """A row of so many numbers from one, or from a row.
-
-    Raises:
-        InputError: another shape.
-    """
+    """A row of so many numbers from one, or from a row."""
     if values.size == 1:
         return np.full(width, values.item())
     if values.shape not in ((width,), (1, width)):
@@ -163,11 +141,7 @@ class Value:
 
     @property
     def chain(self) -> Chain:
-        """The chain that gives these numbers.
-
-        Raises:
-            InputError: there is none.
-        """
+        """The chain that gives these numbers."""
         if unknown := self.unknown:
             choices = ", ".join(ACTIVATIONS)
             raise InputError(
@@ -182,11 +156,7 @@ def given(size: int) -> Value:
 
 
 def layers_to(end: object) -> tuple[Layer, ...]:
-    """The layers that lead to what a network gives.
-
-    Raises:
-        InputError: it is no value, or not what layers give.
-    """
+    """The layers that lead to what a network gives."""
     if not isinstance(end, Value):
         raise InputError("the output doesn't depend on the input")
     return end.chain.layers()
@@ -202,9 +172,6 @@ def take(said: str, action: Action, values: Sequence[Value]) -> Value:
         said: what messages call it.
         action: what it does.
         values: in the order in which its function takes them.
-
-    Raises:
-        InputError: it is nothing that a chain of layers can have; the message names it.
     """
     forms = dict[Chain, _Form]()
     if action.function:

@@ -50,9 +50,6 @@ def convert(path: Path, task: Task, decoder: Path | None, name: str) -> Encoder:
         decoder: path of a model from latents to observations; None for the encoder's
             `reconstruction`, or none.
         name: what tables will call it: lower-case letters, digits and hyphens.
-
-    Raises:
-        InputError: a model can't be read, or is no such chain; the message names the operation.
     """
     encoder, back = _layers(path, task.size)
     if decoder is not None:
@@ -88,9 +85,6 @@ def _read(path: Path) -> tuple[onnx.ModelProto, Constants]:
 
     Exporters put large tensors into a second file: it is read if it is a regular file in the
     model's folder, never through a path or a link.
-
-    Raises:
-        InputError: there is no such file, or it isn't an ONNX model that can be read.
     """
     model = onnx.ModelProto()
     what = f"{path} isn't an ONNX model that can be read"
@@ -107,7 +101,6 @@ def _array(tensor: TensorProto) -> NDArray[np.generic]:
     """The numbers of a tensor.
 
     Raises:
-        InputError: it is of another type, or in another file.
         ValueError: it has another number of them than its shape says.
     """
     if tensor.data_location == TensorProto.EXTERNAL:
@@ -147,11 +140,7 @@ def _fetch_all(tensors: Iterable[TensorProto], folder: Path) -> None:
 
 
 def _bytes(path: Path) -> bytes:
-    """The bytes of a regular file.
-
-    Raises:
-        InputError: there is none, or it is too large.
-    """
+    """The bytes of a regular file."""
     if not exists(path):
         raise InputError(f"no file {path}")
     return read_file(path, _MAX_BYTES)
@@ -216,11 +205,7 @@ def _fold(
 
 
 def _check_size(values: _Values, constants: Constants) -> None:
-    """Refuse a model whose nodes make many large arrays of a few numbers.
-
-    Raises:
-        InputError: what is kept of the nodes so far takes too much memory.
-    """
+    """Refuse a model whose nodes make many large arrays of a few numbers."""
     chains = {chain for value in values.values() if value for chain in value.forms}
     kept = sum(chain.last[0].size for chain in chains if chain.last)
     kept += sum(each.size for each in constants.values())

@@ -45,9 +45,5 @@ def of_seed(name: str, seed: int) -> str:
 
 
 def check_name(name: str) -> None:
-    """Make sure that an encoder can have a name.
-
-    Raises:
-        InputError: it can't.
-    """
+    """Make sure that an encoder can have a name."""
     converted(name, Name, "the name of an encoder")

@@ -129,9 +129,6 @@ def export(encoder: Encoder, path: Path) -> None:
     Its input is `observation`, (n, d) float32 in physical units; its outputs are `latent`, (n, l),
     and, if there is a decoder, `reconstruction`, (n, d) in physical units. Its metadata has the
     header, which describes the environment.
-
-    Raises:
-        InputError: the file exists already, or can't be written.
     """
     if exists(path):
         raise taken(path)

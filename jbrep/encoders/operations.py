@@ -24,9 +24,6 @@ def operation(name: str, *args: Any, **options: Any) -> Action:
         name: that of a function of PyTorch, or of a method of its tensors.
         args: VALUE where it takes what depends on the observation; arrays in float64.
         options: arguments by name.
-
-    Raises:
-        InputError: it is no operation that an encoder's layers can have.
     """
     make = _POINTWISE.get(name)
     if make is None:
@@ -44,11 +41,7 @@ def operation(name: str, *args: Any, **options: Any) -> Action:
 
 
 def _check_dimensions(args: Any) -> None:
-    """Make sure that no constant makes more dimensions than (rows, units).
-
-    Raises:
-        InputError: one does.
-    """
+    """Make sure that no constant makes more dimensions than (rows, units)."""
     for each in args:
         if each is not VALUE and np.ndim(each) > 2:
             raise InputError(
@@ -57,11 +50,7 @@ def _check_dimensions(args: Any) -> None:
 
 
 def check_first_alone(args: Any) -> None:
-    """Make sure that the first of some arguments is what depends on the observation, and no other.
-
-    Raises:
-        InputError: it isn't so.
-    """
+    """Check that the first of some arguments, alone, depends on the observation."""
     if [place for place, each in enumerate(args) if each is VALUE] != [0]:
         raise InputError("its first input alone may depend on the observation")
 
@@ -72,11 +61,7 @@ def _activation(name: str, values: Any = VALUE, inplace: bool = False) -> Action
 
 
 def with_slope(name: str, beta: float) -> Action:
-    """An activation f with a slope, as softplus and SiLU can have: f(beta * values) / beta.
-
-    Raises:
-        InputError: a beta that isn't positive.
-    """
+    """An activation f with a slope, as softplus and SiLU can have: f(beta * values) / beta."""
     if not 0 < beta < math.inf:
         raise InputError(f"its beta is {beta}: it must be positive")
     if beta == 1:

@@ -48,9 +48,6 @@ def unlearned(task: Task, name: str = FULL) -> Encoder:
     Args:
         task: whose observations it reads.
         name: full, coordinates or symmetry.
-
-    Raises:
-        InputError: the task has no such coordinates, or no such symmetry.
     """
     return _scaled(task, name, tried_coordinates(task, UNLEARNED[name]))
 
@@ -86,9 +83,6 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
     scaled by usual ranges, as far as there are any.
     A name such as mymodule:MyEncoder is of code (see `jbrep.encoders.code`); anything but a name is
     an encoder itself, or a user's own (see `jbrep.encoders.base.as_encoder`).
-
-    Raises:
-        InputError: there is none of these, the file can't be used, or it was made for another task.
     """
     if isinstance(task, str):
         from jbrep.envs.description import describe  # imports Gymnasium
@@ -112,9 +106,6 @@ def find_all(given: Any, task: Task) -> dict[str, BaseEncoder]:
         given: one, several, or several by names of the user's, each as `find` takes it. Otherwise
             they have their own names, or where they are from, if a name is taken.
         task: whose observations they read.
-
-    Raises:
-        InputError: two have one name; or as `find`.
     """
     if isinstance(given, Mapping):
         return {label: find(each, task) for label, each in given.items()}
@@ -135,11 +126,7 @@ def find_all(given: Any, task: Task) -> dict[str, BaseEncoder]:
 
 
 def check_found(name: str, task: Task) -> None:
-    """Make sure that there is an encoder of that name, without loading it.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Make sure that there is an encoder of that name, without loading it."""
     if not is_code(name) and not _is_made(name, task):
         _path(name, task)
 
@@ -156,11 +143,7 @@ def _path(name: str | Path, task: Task) -> Path:
 
 
 def find_alone(name: Any, task: Task | None) -> BaseEncoder:
-    """An encoder as `find` takes it, with its task, or by its file alone.
-
-    Raises:
-        InputError: as `find`; or no task is given and there is no such file.
-    """
+    """An encoder as `find` takes it, with its task, or by its file alone."""
     if task:
         return find(name, task)
     if isinstance(name, BaseEncoder):

@@ -56,8 +56,6 @@ class JitterbugVecEnv(VecEnv):
     `non_finite`, whether its physics diverged.
 
     Raises:
-        InputError: unknown task, a number below 1, an encoder made for other features or that
-            can't be used; actions of another shape than (num_envs, k).
         NonFiniteActionError: actions that are not finite.
         EnvironmentFailedError: the environment fails in the middle of an episode.
     """
@@ -126,11 +124,7 @@ class JitterbugVecEnv(VecEnv):
         return self._robots.state
 
     def restore(self, state: State) -> None:
-        """Continue from where the state was taken, to the same bits.
-
-        Raises:
-            InputError: the environment isn't reproducible.
-        """
+        """Continue from where the state was taken, to the same bits."""
         self._robots.restore(state)
 
     def _represent(self, observation: Array) -> Float32:

@@ -57,10 +57,6 @@ class Encoded:
     Attributes:
         encoder: the encoder.
         task: whose observations it reads.
-
-    Raises:
-        InputError: observations that are scaled already, of another size or changed by another
-            wrapper; an environment without a spec and no task; or as `find`.
     """
 
     encoder: BaseEncoder

@@ -82,11 +82,7 @@ class AutoresetLanes:
         return self._start(range(self.lanes.num_lanes))
 
     def step(self, actions: Array) -> AutoresetStep:
-        """Hold an action in every lane for its steps; actions (n, k).
-
-        Raises:
-            InputError, NonFiniteActionError, EnvironmentFailedError: as `Lanes.step`.
-        """
+        """Hold an action in every lane for its steps; actions (n, k)."""
         before = self.lanes.steps
         step, reward, non_finite = self._hold(actions)
         lost = self.lanes.steps == before
@@ -120,11 +116,7 @@ class AutoresetLanes:
         return own | self.lanes.state
 
     def restore(self, state: State) -> None:
-        """Continue from where the state was taken, to the same bits.
-
-        Raises:
-            InputError: the environment isn't reproducible.
-        """
+        """Continue from where the state was taken, to the same bits."""
         lanes = dict(state)
         self._seeds = lanes.pop("first_seeds").copy()
         self._episodes = lanes.pop("episodes").copy()

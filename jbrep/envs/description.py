@@ -71,10 +71,6 @@ def describe(
         history: states that are seen at once, see there.
         domain: numbers and ranges from which each episode draws, such as {"delay": "0..2"}, see
             `jbrep.envs.domain.Domain`.
-
-    Raises:
-        InputError: an unknown task, an environment that can't be made, actions or observations
-            of a kind that isn't possible, no time limit, or an unusable file of features.
     """
     spec, given = find_spec(name), dict(arguments or {})
     if "max_episode_steps" in given:
@@ -99,11 +95,7 @@ def describe(
 
 
 def as_task(given: Task | str) -> Task:
-    """A task, or the one of that name, described.
-
-    Raises:
-        InputError: it is neither, or as `describe`.
-    """
+    """A task, or the one of that name, described."""
     if isinstance(given, Task):
         return given
     if not isinstance(given, str):
@@ -208,11 +200,7 @@ def _below(bound: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def features_of(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
-    """The features of a flat observation, named by the keys of dictionaries, else numbered.
-
-    Raises:
-        InputError: images, or what doesn't make one flat array; the message has the id.
-    """
+    """The features of a flat observation, named by the keys of dictionaries, else numbered."""
     if space.is_np_flattenable and (size := spaces.utils.flatdim(space)) > MAX_FEATURES:
         raise InputError(
             f"{env_id} has observations of {size:,} numbers, flat: at most {MAX_FEATURES:,} are "
@@ -272,9 +260,6 @@ def _find_limit(env: gymnasium.Env[Any, Any], env_id: str, lengths: Iterable["_L
         env: is played.
         env_id: for messages.
         lengths: of the episodes with the seeds 0 and 1, as far as they were played.
-
-    Raises:
-        InputError: no episode is truncated, or another one lasts longer.
     """
     known = [*lengths]
     for seed in range(2, 8):  # others than those of the lengths
@@ -378,11 +363,7 @@ class _TaskChanges(Record, frozen=True):
 
 
 def with_features(task: Task, path: Path) -> Task:
-    """The task with what a TOML file says of its features and rewards.
-
-    Raises:
-        InputError: no such file, or one with unknown or unfitting entries.
-    """
+    """The task with what a TOML file says of its features and rewards."""
     given = read_toml(path)
     try:
         changes = from_plain(given, _TaskChanges)

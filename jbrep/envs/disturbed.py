@@ -106,11 +106,7 @@ class Disturbed:
         return copies | self._draws.state | self._batch.state
 
     def restore(self, state: Mapping[str, Any]) -> tuple[Array, Any]:
-        """As the batch does.
-
-        Raises:
-            InputError: the environment isn't reproducible.
-        """
+        """As the batch does."""
         own = {name: each for name, each in state.items() if name.startswith("domain_")}
         given, info = self._batch.restore({n: v for n, v in state.items() if n not in own})
         if given.tobytes() != own["domain_given"].tobytes():

@@ -62,9 +62,6 @@ class Domain(Record, frozen=True):
         body: the number of the Jitterbug's; None for that of the environment's arguments.
         spread: of each feature that the environment gives, (D,): its standard deviation in episodes
             of random actions.
-
-    Raises:
-        InputError: a number out of its range, or the ends of a range swapped.
     """
 
     noise: tuple[_Positive, _Positive] = (0.0, 0.0)
@@ -78,7 +75,6 @@ class Domain(Record, frozen=True):
     spread: tuple[Finite, ...] = ()
 
     def check(self) -> None:
-        """As for `Record`."""
         for name in NAMES:
             ends = getattr(self, name)
             if ends and ends[0] > ends[1]:
@@ -120,11 +116,7 @@ def _between(ends: Any, at: float) -> Any:
 
 
 def read_ranges(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a domain from numbers and ranges as people write them: 2, "0..3" or [0, 3].
-
-    Raises:
-        InputError: a name that isn't one, or something else than a number or a range.
-    """
+    """Fields of a domain from numbers and ranges as people write them: 2, "0..3" or [0, 3]."""
     kinds = {field.name: field.type for field in structs.fields(Domain) if field.name in NAMES}
     ranges, names = {}, ", ".join(NAMES)
     for name, value in given.items():

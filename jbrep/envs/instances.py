@@ -53,9 +53,6 @@ def take(
         arguments: of the environment.
         max_episode_steps: the time limit; None takes the registered one.
         domain: from which each episode draws its physics, if it does.
-
-    Raises:
-        InputError: it can't be made; the message says why.
     """
     spec = find_spec(env_id)
     given = {**spec.kwargs, **arguments}

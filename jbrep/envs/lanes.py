@@ -25,11 +25,7 @@ class NonFiniteActionError(InputError):
 
 
 def check_counts(num_lanes: int, num_threads: int | None) -> None:
-    """Check the numbers of lanes and threads.
-
-    Raises:
-        InputError: a number below 1.
-    """
+    """Check the numbers of lanes and threads."""
     for count, what in ((num_lanes, "lanes"), (num_threads, "threads")):
         if count is not None and count < 1:
             raise InputError(f"the number of {what} is {count}: it must be at least 1")
@@ -43,9 +39,6 @@ def lanes_at_once(task: Task, most: int, threads: int | None, retries: int) -> "
         most: lanes.
         threads: to step a batch on.
         retries: as `Retries` takes them.
-
-    Raises:
-        InputError: not even one environment can be made.
     """
     try:
         return Lanes(task, most, threads, Retries(retries))
@@ -59,7 +52,6 @@ def check_actions(actions: ArrayLike, num_lanes: int, size: int) -> NDArray[np.f
     """The actions as (num_lanes, size) float64.
 
     Raises:
-        InputError: another shape.
         NonFiniteActionError: a value that is not finite.
     """
     checked: NDArray[np.float64] = np.asarray(actions, dtype=np.float64)
@@ -109,9 +101,6 @@ class Lanes:
         missing: readings that were missing in each lane's episode, (n,).
         num_active: in how many lanes it does.
         envs: the environments themselves: a batch, or one for each lane.
-
-    Raises:
-        InputError: a number below 1, a batch with offsets, or the environment can't be made.
     """
 
     def __init__(
@@ -194,7 +183,6 @@ class Lanes:
         """Take one step in every lane whose episode goes on.
 
         Raises:
-            InputError: actions of another shape than (n, k).
             NonFiniteActionError: actions that are not finite.
             EnvironmentFailedError: the environment raises an error, or gives a number that isn't
                 finite; the message has the lane's seed and step.
@@ -241,11 +229,7 @@ class Lanes:
         return own | self._batch.state
 
     def restore(self, state: State) -> None:
-        """Continue from where the state was taken, to the same bits.
-
-        Raises:
-            InputError: the environment isn't reproducible.
-        """
+        """Continue from where the state was taken, to the same bits."""
         batch = dict(state)
         self._seeds, self._steps = batch.pop("seeds").copy(), batch.pop("steps").copy()
         self.terminated, self.truncated = batch.pop("terminated"), batch.pop("truncated")

@@ -32,9 +32,6 @@ def make_env(
         arguments: of the environment.
         max_episode_steps: the time limit; None takes the registered one.
         options: more arguments, such as render_mode.
-
-    Raises:
-        InputError: it can't be made; the message says why.
     """
     spec = find_spec(env_id)
     if max_episode_steps is not None:
@@ -44,11 +41,7 @@ def make_env(
 
 
 def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:
-    """All lanes as one environment that steps them together, see `is_batched`.
-
-    Raises:
-        InputError: it can't be made; the message says why.
-    """
+    """All lanes as one environment that steps them together, see `is_batched`."""
     with _making(task.id, task.arguments):
         return gymnasium.make_vec(
             spec_of(task),

@@ -26,7 +26,6 @@ def find_spec(name: str) -> EnvSpec:
     """What is registered under a short name or an id.
 
     Raises:
-        InputError: nothing; or the name has a module to import, which only a command line may have.
         ModuleNotFoundError: the package that registers the id isn't installed.
     """
     if ":" in name:
@@ -77,11 +76,7 @@ def modules_of(task: Task) -> list[str]:
 
 
 def import_modules(modules: Iterable[str]) -> None:
-    """Import modules that a user names, also from the working directory; this runs their code.
-
-    Raises:
-        InputError: there is no such module, or its import fails.
-    """
+    """Import modules that a user names, also from the working directory; this runs their code."""
     for module in modules:
         if module.endswith(".py") or "/" in module:
             name = module.rpartition("/")[2].removesuffix(".py")
@@ -114,11 +109,7 @@ def is_code(name: object) -> bool:
 
 
 def import_code(name: object) -> None:
-    """Import the module of code that a command line names; nothing for another text.
-
-    Raises:
-        InputError: as `import_modules`.
-    """
+    """Import the module of code that a command line names; nothing for another text."""
     if is_code(name):
         import_modules([str(name).partition(":")[0]])
 
@@ -129,9 +120,6 @@ def code_named(name: str, what: str) -> Any:
     Args:
         name: of it.
         what: it is, for messages.
-
-    Raises:
-        InputError: its module wasn't imported on request, or has no such name.
     """
     module, _, path = name.partition(":")
     thing = imported(module)
@@ -145,11 +133,7 @@ def code_named(name: str, what: str) -> Any:
 
 
 def name_given(text: str) -> str:
-    """The task that a command line names, once the module before its colon has been imported.
-
-    Raises:
-        InputError: as `import_modules`.
-    """
+    """The task that a command line names, once the module before its colon has been imported."""
     module, colon, name = text.rpartition(":")
     if colon:
         import_modules([module])
@@ -164,11 +148,7 @@ def name_given(text: str) -> str:
 
 
 def environment_versions(task: Task) -> dict[str, str]:
-    """Versions of the packages that a task's environment comes from, but jbrep's own.
-
-    Raises:
-        InputError: as `spec_of`.
-    """
+    """Versions of the packages that a task's environment comes from, but jbrep's own."""
     entry_point: Any = spec_of(task).entry_point
     maker = getattr(entry_point, "func", entry_point)  # shimmy's are partial functions
     module = maker if isinstance(maker, str) else getattr(maker, "__module__", "")

@@ -22,11 +22,7 @@ _EPISODES = 5  # of random actions, in which features spread
 
 
 def with_domain(task: Task, given: Mapping[str, Any]) -> Task:
-    """The task whose episodes draw from ranges, as `read_ranges` takes them; {} for none.
-
-    Raises:
-        InputError: a name or number that can't be, or nothing that the environment has.
-    """
+    """The task whose episodes draw from ranges, as `read_ranges` takes them; {} for none."""
     if not given:
         return task.undisturbed
     ranges, known = read_ranges(given), changeable(task)

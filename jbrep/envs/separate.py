@@ -297,11 +297,7 @@ class Separate:
         }
 
     def restore(self, state: State) -> tuple[Array, dict[str, Array]]:
-        """Play the episodes again; the ones before tell whether these are still the same robots.
-
-        Raises:
-            InputError: they aren't.
-        """
+        """Play the episodes again; the ones before tell whether these are still the same robots."""
         played = state[f"{_BEFORE}lengths"] > 0
         if played.any():
             self._play(_BEFORE, state)

@@ -92,7 +92,6 @@ class Feature(Record, frozen=True, array_like=True):
     frame: Frame = ""  # of an angle: world, or relative to something
 
     def check(self) -> None:
-        """As for `Record`."""
         if not self.unit.isprintable():
             raise InputError(f"the unit of {self.name} must be a word")
         if self.kind == "angle":
@@ -155,7 +154,6 @@ class View(Record, frozen=True):
     history: Annotated[int, Meta(ge=1, le=MAX_FEATURES)] = 1
 
     def check(self) -> None:
-        """As for `Record`."""
         if unknown := set(self.hidden) - {each.name for each in self.features}:
             raise InputError(f"{min(unknown)} is hidden, which is none of its features")
         if not self.places:
@@ -229,9 +227,6 @@ class Task(Record, frozen=True):
             hold:3 has the last one instead, for at most 3 steps. Otherwise they are errors.
         view: what of the environment's observation is seen, if it isn't the current one, whole.
         domain: from which each episode draws what differs, if anything does.
-
-    Raises:
-        InputError: a field that doesn't fit this description.
     """
 
     id: Id
@@ -258,7 +253,6 @@ class Task(Record, frozen=True):
     domain: Domain | UnsetType = UNSET
 
     def check(self) -> None:
-        """As for `Record`."""
         if self.view and self.features != self.view.seen(self.action_low, self.action_high):
             raise InputError("its features must be those that its view shows")
         try:
@@ -308,11 +302,7 @@ class Task(Record, frozen=True):
 
     @property
     def known_timestep(self) -> float:
-        """From one step to the next [s].
-
-        Raises:
-            InputError: it isn't known.
-        """
+        """From one step to the next [s]."""
         if self.timestep is None:
             raise InputError(
                 f"the time step of {self.name} is not known: give it as timestep in a file of "
@@ -463,9 +453,6 @@ def check_same(expected: Task, actual: Task, what: str) -> None:
         expected: the task at hand.
         actual: the one that something was made for; another body of the same robot will do.
         what: was made for it, for the message.
-
-    Raises:
-        InputError: another environment, or other features.
     """
     if actual.id != expected.id:
         raise InputError(

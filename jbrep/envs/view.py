@@ -22,10 +22,6 @@ def with_view(task: Task, hidden: Iterable[str] = (), history: int = 1) -> Task:
         task: without a view.
         hidden: names or patterns, as in `velocity_*`, of features or groups to leave out.
         history: states that are seen, the current one among them.
-
-    Raises:
-        InputError: a pattern that fits nothing, nothing left, too many features, or the task has a
-            view already.
     """
     if task.view:
         raise InputError(f"some of {task.name} is hidden, or seen with its past, already")

@@ -41,12 +41,7 @@ def write(
     policy: GoodPolicy | None = None,
     truth: Dataset | None = None,
 ) -> Evaluation:
-    """Judge encoders as `diagnose`, and write evaluation.json into a folder, made if needed.
-
-    Raises:
-        InputError: as `diagnose`, or the folder holds the evaluation of other encoders or data, or
-            with another policy or truth.
-    """
+    """Judge encoders as `diagnose`, and write evaluation.json into a folder, made if needed."""
     path = folder / EVALUATION
     judged = {label: find(each, data.task) for label, each in encoders.items()}
     make_folder(folder, (EVALUATION,))
@@ -66,11 +61,7 @@ def _before(
     policy: GoodPolicy | None,
     truth: Dataset | None,
 ) -> Evaluation | None:
-    """The evaluation of the same that a repeated one replaces, if there is one.
-
-    Raises:
-        InputError: what is there is of something else, or can't be read.
-    """
+    """The evaluation of the same that a repeated one replaces, if there is one."""
     if not exists(path):
         return None
     on = data.dataset.manifest.fingerprint, _fingerprint(truth)
@@ -107,10 +98,6 @@ def diagnose(
             without one.
         truth: the data set that this was derived from, with features that it hides: how well they
             can be read from a code is among the probes.
-
-    Raises:
-        InputError: an encoder made for other features, or whose numbers overflow; or as `find`
-            or `HeldOut`.
     """
     data = ScaledDataset.of(data)
     held_out = HeldOut(data, truth)

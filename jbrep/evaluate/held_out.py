@@ -43,9 +43,6 @@ class HeldOut:
         hidden: names of the features that the truth alone shows.
         numbers: of the held-out episodes within the data set, (episodes,).
         num_groups: groups of episodes.
-
-    Raises:
-        InputError: the truth is of another motion, or shows no more.
     """
 
     def __init__(self, data: ScaledDataset, truth: Dataset | None = None):
@@ -123,11 +120,7 @@ class HeldOut:
 
 
 def hidden_of(dataset: Dataset, truth: Dataset) -> tuple[str, ...]:
-    """The features that a data set of the same motion has beside those of another.
-
-    Raises:
-        InputError: the motion is another, or nothing is hidden.
-    """
+    """The features that a data set of the same motion has beside those of another."""
     moved, seen = (
         [shard.sha256["action"] for shard in each.manifest.shards] for each in (truth, dataset)
     )

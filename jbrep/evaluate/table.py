@@ -102,7 +102,6 @@ def read_diagnostics(path: Path, sha256: str | None = None) -> list[Diagnosed]:
         sha256: of the file, if it is known.
 
     Raises:
-        InputError: it can't be read.
         DamageError: it is not such a table, or has another SHA-256.
     """
     rows = read_csv(path, _COLUMNS, sha256)

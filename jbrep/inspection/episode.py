@@ -32,9 +32,6 @@ def record_episode(
         encoder: for the episode's task; its latent is shown with what it predicts, and its
             reconstruction if it decodes.
         examples: what forecasts and directions are fitted to; the episode itself if not given.
-
-    Raises:
-        InputError: the file can't be written.
     """
     task, motion = rollout.task, rollout.motion
     content = [rollout.observation, rollout.action, rollout.reward]

@@ -112,11 +112,7 @@ class Recording:
         self.send_columns(path, times, rr.Scalars.columns(scalars=values))
 
     def write(self, path: Path, blueprint: rrb.Blueprint) -> None:
-        """Write the recording with its layout, whole or not at all.
-
-        Raises:
-            InputError: another kind of file exists there, or it can't be written.
-        """
+        """Write the recording with its layout, whole or not at all."""
         make_folder(path.parent)
         self._stream.send_blueprint(blueprint)
         with exclusive(path, beside=True):
@@ -125,11 +121,7 @@ class Recording:
 
 
 def check_out(path: Path) -> None:
-    """Make sure that a recording can be there, and only an earlier one would be overwritten.
-
-    Raises:
-        InputError: it is called otherwise, or another kind of file exists there.
-    """
+    """Make sure that a recording can be there, and only an earlier one would be overwritten."""
     if not exists(path):
         if path.suffix != SUFFIX:
             name = path.with_suffix(SUFFIX)

@@ -55,9 +55,6 @@ def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
         runs: of one study, or of several.
         source: their folder, as the recording's title.
         path: the .rrd file.
-
-    Raises:
-        InputError: the file can't be written.
     """
     labels = defaultdict(list)
     for run in sorted(with_failure_returns(runs), key=lambda run: (run.label, run.seed)):
@@ -119,10 +116,6 @@ def inspect(
 
     Returns:
         The file.
-
-    Raises:
-        InputError: any of these can't be found, or they are inconsistent, or the file to be written
-            exists and is no recording.
     """
     if out:
         check_out(out)

@@ -48,9 +48,6 @@ def record_traversal(rollout: Rollout, path: Path, encoder: BaseEncoder) -> None
         rollout: the episode whose latents give the range of each unit.
         path: the .rrd file.
         encoder: for the episode's task.
-
-    Raises:
-        InputError: the encoder can't decode, or the file can't be written.
     """
     encoder.check_decodes("--traverse shows what each unit is decoded to")
     task, swept = rollout.task, sweep(encoder.encode(rollout.observation))

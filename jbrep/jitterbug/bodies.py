@@ -127,11 +127,7 @@ def _draw(number: int, random: np.random.Generator) -> Body:
 
 
 def check_body(body: Any, materials: Any) -> None:
-    """Check the choice of a body: a number, "random", or None for the published robot.
-
-    Raises:
-        InputError: anything else.
-    """
+    """Check the choice of a body: a number, "random", or None for the published robot."""
     if type(materials) is not bool:
         raise InputError(f"materials is {materials!r}: it must be true or false")
     if body is None or body == RANDOM:

@@ -67,9 +67,6 @@ class Jitterbug(base.Task):
         task: its name, a key of `tasks.TASKS`.
         random: a `RandomState`, a seed, or None. A seed gives the same episodes as in the
             Gymnasium environment.
-
-    Raises:
-        InputError: unknown task.
     """
 
     def __init__(self, task: str, random: np.random.RandomState | int | None = None):
@@ -136,9 +133,6 @@ def load(
         time_limit: of an episode [s].
         environment_kwargs: for `dm_control.rl.control.Environment`.
         visualize_reward: colour the robot by its reward.
-
-    Raises:
-        InputError: unknown task.
     """
     name = tasks.get_task(task).name
     environment = SUITE[name](time_limit, seed, environment_kwargs)

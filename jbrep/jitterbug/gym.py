@@ -59,11 +59,7 @@ class _View:
 
 
 def describe(arguments: Mapping[str, Any], max_episode_steps: int | None) -> Task:
-    """A task as plain data, see `jbrep.envs.description`.
-
-    Raises:
-        InputError: an argument that doesn't change the robot, or no such body.
-    """
+    """A task as plain data, see `jbrep.envs.description`."""
     given = {name: value for name, value in arguments.items() if name != "task"}
     if unknown := set(given) - _BODY_ARGUMENTS:
         raise InputError(
@@ -89,10 +85,6 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     When the physics diverges, the episode is truncated with the last finite observation, reward
     0 and `info["non_finite"]` true.
-
-    Raises:
-        InputError: unknown task, form or render mode, or "human" without a display; an action of
-            another shape than (1,), or not finite.
     """
 
     describe = staticmethod(describe)
@@ -174,11 +166,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._simulation.quarter_turn(shift)
 
     def render(self) -> Any:
-        """A frame, as Gymnasium's own MuJoCo environments give it.
-
-        Raises:
-            InputError: no OpenGL to render with, or a package for rendering is missing.
-        """
+        """A frame, as Gymnasium's own MuJoCo environments give it."""
         if self.render_mode is None:
             return None
         data = self.data
@@ -221,10 +209,6 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         autoreset_mode: SAME_STEP, which resets a lane in the step that ends its episode, or
             DISABLED, which leaves it to `reset` with `options={"reset_mask": ...}`.
         dtype: of observations, float32 or float64.
-
-    Raises:
-        InputError: unknown task, form, dtype or mode, a number below 1; actions of another shape
-            than (num_envs, 1), or not finite.
     """
 
     changeable = ("friction", "mass", "push", "body")  # by a domain, see `jbrep.envs.domain`

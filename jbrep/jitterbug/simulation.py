@@ -40,9 +40,6 @@ class Simulation:
     Attributes:
         readings: what the tasks read of the current states; a new object after each step.
         target_quaternion: of the lanes' targets, (n, 4).
-
-    Raises:
-        InputError: a number below 1; no such body.
     """
 
     def __init__(

@@ -335,11 +335,7 @@ TASKS = {
 
 
 def get_task(name: str) -> JitterbugTask:
-    """Look up a task by its name.
-
-    Raises:
-        InputError: the name is unknown; the message lists the tasks.
-    """
+    """Look up a task by its name."""
     return choose(name, TASKS, "task")
 
 

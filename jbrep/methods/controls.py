@@ -22,13 +22,11 @@ class Full(ClosedForm, frozen=True, kw_only=True):
     name: ClassVar[str] = FULL
 
     def check(self) -> None:
-        """As for `Record`."""
         super().check()
         if self.on != self.defaults()["on"]:
             raise InputError(f"{self.name} is on {self.defaults()['on']}: for another, see --kind")
 
     def make(self, data: ScaledDataset) -> Made:
-        """As for `ClosedForm`."""
         return Made((), ())
 
 
@@ -69,7 +67,6 @@ class Subset(ClosedForm, frozen=True, kw_only=True):
         return self.replace(features=tuple(name for i, name in each if i in places))
 
     def make(self, data: ScaledDataset) -> Made:
-        """As for `ClosedForm`."""
         chosen = [i for i, name in enumerate(data.names) if name in self.features]
         return Made((dense(np.eye(data.size)[chosen], np.zeros(len(chosen))),))
 
@@ -90,7 +87,6 @@ class Noise(Coded, ClosedForm, frozen=True, kw_only=True):
     seed: Seed = 0
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         if self.keep:
             raise InputError("noise keeps all features as they are: leave keep out")
         if self.latent <= data.size:
@@ -100,7 +96,6 @@ class Noise(Coded, ClosedForm, frozen=True, kw_only=True):
             )
 
     def make(self, data: ScaledDataset) -> Made:
-        """As for `ClosedForm`."""
         generator = np.random.default_rng(self.seed)
         shape = self.latent - data.size, data.size
         weight = _FREQUENCY * generator.normal(size=shape)
@@ -117,7 +112,6 @@ class Random(Coded, ClosedForm, frozen=True, kw_only=True):
     seed: Seed = 0
 
     def make(self, data: ScaledDataset) -> Made:
-        """As for `ClosedForm`."""
         drawn = np.random.default_rng(self.seed).normal(size=(data.size, self.latent))
         directions, triangle = np.linalg.qr(drawn)
         return Made(*linear_code((directions * np.sign(np.diag(triangle))).T, data.moments))
@@ -132,7 +126,6 @@ class Untrained(Network, ClosedForm, frozen=True, kw_only=True):
     seed: Seed = 0
 
     def make(self, data: ScaledDataset) -> Made:
-        """As for `ClosedForm`."""
         architecture = get_architecture(self.architecture)
         encoder, decoder = stacks(architecture, data.size, self.latent, self.seed)
         return Made(layers(encoder), layers(decoder))

@@ -46,7 +46,6 @@ class Ddae(Reconstructing, frozen=True, kw_only=True):
     weights: FeatureWeights = field(default_factory=dict)
 
     def objective(self, data: ScaledDataset) -> Objective:
-        """As for `Learned`."""
         return DdaeObjective(self, data)
 
 
@@ -81,7 +80,6 @@ class DdaeObjective(Objective):
         return now, windows.rows(numbers, self.horizon) if self.horizon else now
 
     def loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
-        """As for `Objective`."""
         now, target = batch
         error = cross_entropy(self.decoder(self.encoder(now)), target, self._weights).mean()
         squares = torch.stack([weight.square().sum() for weight in self._matrices])

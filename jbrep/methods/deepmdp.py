@@ -40,7 +40,6 @@ class DeepMDP(Network, Learned, frozen=True, kw_only=True):
     seed: Seed = 0
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         super().check_data(data)
         if not self.reward:
             raise InputError(
@@ -55,14 +54,12 @@ class DeepMDP(Network, Learned, frozen=True, kw_only=True):
 
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        """As for `Method`."""
         told = 1 - metrics["loss_by_term"]["reward"]
         return (
             f"predicts {told:.2f} of held-out rewards (1 - error / variance in the training part)"
         )
 
     def objective(self, data: ScaledDataset) -> Objective:
-        """As for `Learned`."""
         return DeepMDPObjective(self, data)
 
 
@@ -134,7 +131,6 @@ class DeepMDPObjective(Objective):
         return torch.stack([torch.linalg.eigvalsh(each)[-1] for each in squares]).prod().sqrt()
 
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
-        """As for `Objective`."""
         errors = self._errors(batch)
         return torch.stack([weight * errors[name] for name, weight in self._weights.items()]).sum()
 

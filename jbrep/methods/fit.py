@@ -64,11 +64,7 @@ class Plan(NamedTuple):
     path: Path
 
     def find(self) -> Encoder | None:
-        """The encoder in the file, perhaps not yet trained to the end; None if there is no file.
-
-        Raises:
-            InputError: the file was made with other settings or from other data.
-        """
+        """The encoder in the file, perhaps not yet trained to the end; None if there is no file."""
         if not exists(self.path):
             return None
         encoder = load(self.path)
@@ -80,11 +76,7 @@ class Plan(NamedTuple):
         return encoder
 
     def is_complete(self) -> bool:
-        """Whether the file holds this encoder, trained to the end.
-
-        Raises:
-            InputError: as `find`.
-        """
+        """Whether the file holds this encoder, trained to the end."""
         encoder = self.find()
         epochs = self.method.epochs if isinstance(self.method, Learned) else None
         return encoder is not None and encoder.header.metrics.get("epochs") == epochs
@@ -128,9 +120,6 @@ class Fitter:
             kind: a key of METHODS.
             name: of the encoder; made from the method and its settings if not given.
             settings: of the method, as text or values.
-
-        Raises:
-            InputError: as `plan`, or the files can't be written.
         """
         with single_thread():
             plan = self.plan(kind, name=name, **settings)
@@ -138,13 +127,7 @@ class Fitter:
         return Fitted(load(plan.path), plan.path, is_new, self._data)
 
     def plan(self, kind: str, *, name: str | None = None, **settings: Any) -> Plan:
-        """What `fit` would make.
-
-        Raises:
-            InputError: an unknown kind; a setting that it doesn't take, that is out of range or
-                can't be used with the data; or a file that was made with other settings or from
-                other data.
-        """
+        """What `fit` would make."""
         method = get_method(kind).of(settings)
         data = self._scaled_data(method)
         method = method.resolved(data)

@@ -58,13 +58,11 @@ class Forward(Network, Learned, frozen=True, kw_only=True):
     seed: Seed = 0
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         super().check_data(data)
         check_targets(data, self.name, {**weights_of(self), "inverse": self.inverse})
 
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        """As for `Method`."""
         steps, lost = max(metrics["loss_by_horizon"].items(), key=lambda each: int(each[0]))
         known = [part for part in ("changes", "reward") if part in lost] or list(lost)
         if not known:  # only the action was to be told
@@ -74,7 +72,6 @@ class Forward(Network, Learned, frozen=True, kw_only=True):
         return f"predicts {told} over {steps} held-out steps ({what})"
 
     def objective(self, data: ScaledDataset) -> Objective:
-        """As for `Learned`."""
         return ForwardObjective(self, data)
 
 
@@ -195,7 +192,6 @@ class ForwardObjective(Objective):
     def draws(
         self, windows: Windows, numbers: Tensor, size: int, generator: torch.Generator
     ) -> Iterator[_Batch]:
-        """As for `Objective`."""
         parts = (part.split(size, -1) for part in self.batch(windows, numbers))
         yield from map(_Batch, *parts)
 
@@ -205,7 +201,6 @@ class ForwardObjective(Objective):
         return (predicted - batch.targets).square().mean(2)
 
     def loss(self, batch: _Batch) -> Tensor:
-        """As for `Objective`."""
         code = self.encoder(batch.now.T)
         loss = (self._errors(batch, code) @ self._weight).mean()
         if self._inverse_weight:

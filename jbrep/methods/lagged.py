@@ -37,9 +37,6 @@ class Lagged:
         later_mean: of the rows at each lag, (lags, size).
         later: E[y y'] of the rows at each lag, (lags, size, size).
         across: E[x y'], (lags, n, size).
-
-    Raises:
-        InputError: no episode is longer than the longest lag, or there are too few.
     """
 
     def __init__(
@@ -100,12 +97,10 @@ class Slow(Directions, frozen=True, kw_only=True):
 
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        """As for `Method`."""
         found = _correlations(metrics, latent)
         return f"changes slowly: units correlate {found} with themselves a lag later"
 
     def make(self, data: ScaledDataset) -> Made:
-        """As for `ClosedForm`."""
         lagged = Lagged(data, self.lags, data.size, lambda block: block.later(0))
         eigenvalues, directions, moments = _slowest(lagged, self.lags, data)
         spectra = {str(lag): _slowest(lagged, (lag,), data)[0].tolist() for lag in lagged.lags}
@@ -150,12 +145,10 @@ class Vamp(Directions, frozen=True, kw_only=True):
 
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        """As for `Method`."""
         found = _correlations(metrics, latent)
         return f"tells the state a lag later: units correlate {found} with it"
 
     def make(self, data: ScaledDataset) -> Made:
-        """As for `ClosedForm`."""
         lags, size = self.lags, data.size
         longest = max(lags)
 

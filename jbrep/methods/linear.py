@@ -66,11 +66,7 @@ def signed(weight: Array) -> Array:
 
 
 def inverse_root(covariance: Array, what: str) -> Array:
-    """C^(-1/2) of a covariance (n, n).
-
-    Raises:
-        InputError: it is singular; the message says what it is the covariance of.
-    """
+    """C^(-1/2) of a covariance (n, n)."""
     variances, vectors = np.linalg.eigh(covariance)
     if not variances[0] > _NEGLIGIBLE * variances[-1]:
         raise InputError(
@@ -104,9 +100,6 @@ def whitening(
         data: that it is of.
         total: variances that show what is negligible, where C is what a regression left of them.
         others: what features would be linear functions of, if C were singular.
-
-    Raises:
-        InputError: it is singular; the message names the features.
     """
     deviation = np.sqrt(np.maximum(np.diag(covariance) if total is None else total, _TINY))
     variances, vectors = np.linalg.eigh(covariance / np.outer(deviation, deviation))
@@ -129,7 +122,6 @@ class PCA(Coded, ClosedForm, frozen=True, kw_only=True):
     min_reduction: ClassVar[int | None] = 0
 
     def make(self, data: ScaledDataset) -> Made:
-        """As for `ClosedForm`."""
         return Made(*principal_code(data, self.latent))
 
 
@@ -139,7 +131,6 @@ class Directions(Coded, ClosedForm, frozen=True, kw_only=True):
     min_reduction: ClassVar[int | None] = 0
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         if constant := data.constant_features:
             raise InputError(
                 f"{constant[0]} is constant in {data.dataset.folder}: let it pass around the "

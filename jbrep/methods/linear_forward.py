@@ -50,19 +50,16 @@ class LinearForward(Directions, frozen=True, kw_only=True):
     reward: RewardWeight = 1.0
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         super().check_data(data)
         check_targets(data, self.name, weights_of(self))
 
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        """As for `Method`."""
         explained = [each**2 for each in metrics["spectrum"]]
         share = sum(explained[:latent]) / sum(explained)
         return f"keeps {share:.0%} of what a linear code can tell of what comes next"
 
     def make(self, data: ScaledDataset) -> Made:
-        """As for `ClosedForm`."""
         size = data.size
         moments, shared, variances = _moments(data, self.horizons)
         weights = self._scales(data)
@@ -98,9 +95,6 @@ def _moments(data: ScaledDataset, horizons: tuple[int, ...]) -> tuple[Moments, A
     """Moments of rows with actions (p,), their covariances with targets, (p, t), and variances.
 
     The variances are those of the targets, (t,).
-
-    Raises:
-        InputError: there are no more windows than regressors, which could tell anything of them.
     """
     size, longest, turn = data.size, max(horizons), turns(data)
     actions = longest * data.task.action_size
@@ -132,11 +126,7 @@ def weights_of(method: Any) -> dict[str, float]:
 
 
 def check_targets(data: ScaledDataset, kind: str, weights: Mapping[str, float]) -> None:
-    """Make sure that a kind of method has something to predict, with these weights of targets.
-
-    Raises:
-        InputError: it hasn't: all weights are 0, or all but that of a constant reward.
-    """
+    """Make sure that a kind of method has something to predict, with these weights of targets."""
     weighted = [name for name, weight in weights.items() if weight]
     if not weighted:
         raise InputError(f"{kind} has nothing to predict: all its weights are 0")

@@ -50,7 +50,6 @@ class LldVae(Variational, frozen=True, kw_only=True):
     weights: FeatureWeights = field(default_factory=dict)
 
     def objective(self, data: ScaledDataset) -> Objective:
-        """As for `Learned`."""
         return LldVaeObjective(self, data)
 
 
@@ -69,7 +68,6 @@ class LldVaeObjective(VariationalObjective):
         self._transition_weight = method.transition
 
     def build(self, data: ScaledDataset) -> None:
-        """As for `VariationalObjective`."""
         count = self._latent
         self.decoder = stack((count, *reversed(self._hidden), 2 * data.size), "linear")
         self.transition = stack((count, count, count * (3 + data.task.action_size)), "linear")
@@ -87,7 +85,6 @@ class LldVaeObjective(VariationalObjective):
         return left, right, driven[:, :, 0] + offset
 
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
-        """As for `Objective`."""
         now, action, after, noise = batch
         mean, log_deviation = posterior(self.encoder(now))
         code = mean + log_deviation.exp() * noise
@@ -113,7 +110,6 @@ class LldVaeObjective(VariationalObjective):
         return (each if self._weights is None else each * self._weights).sum(1)
 
     def layers(self) -> tuple[Layers, Layers]:
-        """As for `Objective`."""
         return first_half(layers(self.encoder)), first_half(layers(self.decoder))
 
 

@@ -35,7 +35,6 @@ class OFE(Learned, frozen=True, kw_only=True):
     seed: Seed = 0
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         super().check_data(data)
         if self.latent < data.size + self.blocks:
             raise InputError(
@@ -44,7 +43,6 @@ class OFE(Learned, frozen=True, kw_only=True):
             )
 
     def objective(self, data: ScaledDataset) -> Objective:
-        """As for `Learned`."""
         return OFEObjective(self, data)
 
 
@@ -146,7 +144,6 @@ class OFEObjective(Objective):
         return windows.steps(numbers)
 
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
-        """As for `Objective`."""
         now, actions, after = batch
         known = self.beside_action(torch.cat((self.encoder(now), actions), 1))
         error: Tensor = (self.next_row(known) - after).square().mean()

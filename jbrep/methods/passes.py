@@ -74,10 +74,6 @@ def blocks(data: ScaledDataset, horizon: int, width: int, work: int) -> Iterator
         work: products that the caller makes of each window and sums. Where those of all windows
             would be more than 10^12, as of 5 million rows of some hundreds of features, only so
             many blocks are given.
-
-    Raises:
-        InputError: no episode is longer than the horizon, or it is too long for so many features
-            and actions.
     """
     if work > _WIDEST:
         raise InputError(
@@ -104,9 +100,6 @@ def check_enough(count: int, width: int, data: ScaledDataset, apart: int, less: 
         data: that they are of.
         apart: steps from the first to the last row of a window.
         less: what to give to have more windows, or fewer numbers.
-
-    Raises:
-        InputError: there aren't.
     """
     if count <= width:
         raise InputError(

@@ -25,20 +25,12 @@ _EXAMPLES = "it must be full, or a method and a latent size, such as dae-8, dae-
 
 
 def get_method(name: str) -> type[Method]:
-    """The method of that name.
-
-    Raises:
-        InputError: the name is unknown; the message lists the methods.
-    """
+    """The method of that name."""
     return choose(name, METHODS, "kind")
 
 
 def with_preset(kind: str, preset: str | None, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a method, beside those of one of its presets, if there is one.
-
-    Raises:
-        InputError: an unknown kind, or it has no such preset.
-    """
+    """Settings of a method, beside those of one of its presets, if there is one."""
     method = get_method(kind)
     if preset is None:
         return dict(settings)
@@ -60,9 +52,6 @@ def each_named(
         seeds: n for one of each of the seeds 0 to n - 1; None for the usual one.
         name: of the only one of each seed; None for what they are.
         settings: of all of them.
-
-    Raises:
-        InputError: a setting that the kind doesn't take, or one that is missing.
     """
     method = get_method(kind)
     if name and len(latents) > 1:
@@ -105,11 +94,7 @@ def name_of(method: Method) -> str:
 
 
 def read_name(name: str) -> Recipe:
-    """The method and settings that a name stands for: the inverse of `name_of`.
-
-    Raises:
-        InputError: it stands for none.
-    """
+    """The method and settings that a name stands for: the inverse of `name_of`."""
     stem, latent, _ = EncoderName.parse(name)
     mistake = InputError(f"unknown representation {name!r}: {_EXAMPLES}")
     kinds = [kind for kind in METHODS if f"{stem}-".startswith(f"{kind}-")]

@@ -27,7 +27,6 @@ class SelfPrediction(Network, Learned, frozen=True, kw_only=True):
     seed: Seed = 0
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         super().check_data(data)
         if self.latent == 1:
             raise InputError(
@@ -36,7 +35,6 @@ class SelfPrediction(Network, Learned, frozen=True, kw_only=True):
             )
 
     def objective(self, data: ScaledDataset) -> Objective:
-        """As for `Learned`."""
         return SelfPredictionObjective(self, data)
 
 
@@ -71,7 +69,6 @@ class SelfPredictionObjective(Objective):
         return windows.steps(numbers)
 
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
-        """As for `Objective`."""
         now, actions, after = batch
         predicted = self.next_code(torch.cat((self.encoder(now), actions), 1))
         with torch.no_grad():

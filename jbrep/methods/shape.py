@@ -33,9 +33,6 @@ def complete(
         data: scaled.
         codes: raw, standard or white.
         keep: features that pass around the layers, unless the method says which.
-
-    Raises:
-        InputError: the code can't be whitened.
     """
     encoder, decoder = made.encoder, made.decoder
     if not encoder:

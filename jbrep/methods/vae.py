@@ -51,7 +51,6 @@ class Vae(Variational, frozen=True, kw_only=True):
     weights: FeatureWeights = field(default_factory=dict)
 
     def objective(self, data: ScaledDataset) -> Objective:
-        """As for `Learned`."""
         return VaeObjective(self, data)
 
 
@@ -122,11 +121,9 @@ class VaeObjective(VariationalObjective):
     """The cross-entropy of a row, summed over its numbers, and `beta` times the divergence."""
 
     def build(self, data: ScaledDataset) -> None:
-        """As for `VariationalObjective`."""
         self.decoder = stack((self._latent, *reversed(self._hidden), data.size), "linear")
 
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
-        """As for `Objective`."""
         rows, noise = batch
         mean, log_deviation = posterior(self.encoder(rows))
         logits = self.decoder(mean + log_deviation.exp() * noise)
@@ -134,7 +131,6 @@ class VaeObjective(VariationalObjective):
         return (error + self._beta * divergence(mean, log_deviation).sum(1)).mean()
 
     def layers(self) -> tuple[Layers, Layers]:
-        """As for `Objective`."""
         return first_half(layers(self.encoder)), sigmoid_layers(layers(self.decoder))
 
 

@@ -57,9 +57,6 @@ def observe(
         task: for policies by their names.
         episodes: how many, of each run.
         target_yaw: where every target points [rad].
-
-    Raises:
-        InputError: as `find_player`, or policies of several tasks, or of another robot's.
     """
     subjects: dict[str, list[Player]] = {}
     shared = task

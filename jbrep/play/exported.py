@@ -26,7 +26,6 @@ def read_exported(path: Path) -> tuple[Any, Described]:
     """The session of onnxruntime that computes a policy's actions, and what the file says of it.
 
     Raises:
-        InputError: no such file, or no policy that `jbrep policy export` wrote.
         DamageError: it can't be read.
     """
     import onnxruntime
@@ -45,11 +44,7 @@ def read_exported(path: Path) -> tuple[Any, Described]:
 
 
 def exported_player(path: Path, task: Task | None = None) -> Player:
-    """The policy in a file, to play its own task, maybe with another body or time limit.
-
-    Raises:
-        InputError: as `read_exported`, or it is another task.
-    """
+    """The policy in a file, to play its own task, maybe with another body or time limit."""
     session, said = read_exported(path)
     known = task or said.environment
     check_same(known, said.environment, str(path))

@@ -39,9 +39,6 @@ class Pace:
         fps: frames per second of the film.
         speed: simulated seconds per second of the film.
         seconds: simulated seconds to show, from the start; all if None.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     fps: float = 25
@@ -68,10 +65,6 @@ class Film:
         rollouts: the episodes, of the same task and from the same start.
         camera: shows each episode.
         pace: how fast to show them.
-
-    Raises:
-        InputError: an episode can't be shown, the tasks or starts differ, or the frames would be
-            too wide.
     """
 
     rollouts: Sequence[Rollout]
@@ -143,10 +136,6 @@ class Film:
         Args:
             path: the file, .mp4 or .gif.
             show: whether to show progress.
-
-        Raises:
-            InputError: another suffix, the file exists or can't be written, or the film is too
-                long or too large for a GIF.
         """
         form = get_format(path)
         pixels = len(self) * self.width * self.camera.height
@@ -216,11 +205,7 @@ FORMATS = {
 
 
 def get_format(path: Path) -> Format:
-    """The format of a new video, by its suffix.
-
-    Raises:
-        InputError: an unknown suffix, or the file exists.
-    """
+    """The format of a new video, by its suffix."""
     if path.suffix.lower() not in FORMATS:
         raise InputError(
             f"{path} isn't named as a video: the suffix must be {' or '.join(FORMATS)}"

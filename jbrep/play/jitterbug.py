@@ -60,9 +60,6 @@ def turn_targets(lanes: Lanes, yaw: float) -> None:
     Args:
         lanes: of Jitterbugs.
         yaw: orientation of the targets [rad].
-
-    Raises:
-        InputError: another robot, or one with a domain.
     """
     if jitterbug_task(lanes.task) is None:
         raise InputError(f"{lanes.task.name} has no target to turn: only the Jitterbug's tasks do")

@@ -61,11 +61,7 @@ class Table(Document, frozen=True, kw_only=True):
 
 
 def read_perturbation(text: str) -> dict[str, str]:
-    """The numbers and ranges of a domain as people write it: delay=2 or noise=0.1,delay=1..3.
-
-    Raises:
-        InputError: something else, or what `read_ranges` refuses.
-    """
+    """The numbers and ranges of a domain as people write it: delay=2 or noise=0.1,delay=1..3."""
     given: dict[str, str] = {}
     for part in text.split(","):
         name, equals, value = part.strip().partition("=")
@@ -87,9 +83,6 @@ def domains_of(task: Task, chosen: Sequence[str]) -> tuple[dict[str, Domain | No
     Args:
         task: what is played; its own domain, if it has one, has the second row.
         chosen: as `read_perturbation` takes them; none for the usual ones that there can be.
-
-    Raises:
-        InputError: as `read_perturbation` or `with_domain`.
     """
     wanted = {text: read_perturbation(text) for text in chosen or USUAL}
     known = changeable(task)
@@ -119,9 +112,6 @@ def perturb(
         episodes: of each.
         threads: as for `Player.returns`.
         retries: likewise.
-
-    Raises:
-        InputError, EnvironmentFailedError: as `Player.returns`.
     """
     first = None
     for name, domain in domains.items():

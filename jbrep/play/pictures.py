@@ -51,9 +51,6 @@ class Camera:
         name: of one that the model has; if None, its first that follows a body, or else one that
             follows the robot from aside.
         width, height: of its pictures [pixels], even numbers.
-
-    Raises:
-        InputError: an invalid size.
     """
 
     def __init__(self, name: str | None = None, width: int = 640, height: int = 480):
@@ -78,11 +75,7 @@ class Camera:
         self._studios = []
 
     def picture(self, motion: Motion, state: int) -> Pixels:
-        """One of the states of an episode, (height, width, 3).
-
-        Raises:
-            InputError: the model has no such camera, or there is no OpenGL.
-        """
+        """One of the states of an episode, (height, width, 3)."""
         studio = self._studio(motion.model)
         motion.put(studio.data, state)
         mujoco.mj_fwdPosition(studio.model, studio.data)
@@ -108,11 +101,7 @@ class Camera:
 
 
 def find_camera(model: mujoco.MjModel, name: str | None) -> mujoco.MjvCamera | int:
-    """A camera of the model by its name, or the one that suits it, see `Camera`.
-
-    Raises:
-        InputError: there is none of that name.
-    """
+    """A camera of the model by its name, or the one that suits it, see `Camera`."""
     if name is not None:
         return choose(name, {model.camera(i).name: i for i in range(model.ncam)}, "camera")
     for number in range(model.ncam):

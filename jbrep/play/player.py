@@ -44,9 +44,6 @@ class Player(NamedTuple):
         Args:
             episodes: their numbers, from 0.
             target_yaw: where every target of the Jitterbug points [rad]; None draws it.
-
-        Raises:
-            InputError: too many steps to hold in memory; the environment can't be made, or fails.
         """
         if len(episodes) * self._episode_bytes > _MAX_BYTES:
             raise InputError(
@@ -102,11 +99,7 @@ class Player(NamedTuple):
         )
 
     def play_first(self, count: int, target_yaw: float | None = None) -> Iterator[Rollout]:
-        """Play the first `count` of these episodes, with bounded memory.
-
-        Raises:
-            InputError: more episodes than an evaluation may have.
-        """
+        """Play the first `count` of these episodes, with bounded memory."""
         check_episodes(count)
         most = max(1, _BATCH_BYTES // self._episode_bytes)
         for first in range(0, count, most):
@@ -122,7 +115,6 @@ class Player(NamedTuple):
             retries: how often in a row an episode in which the environment fails is played again.
 
         Raises:
-            InputError: more episodes than an evaluation may have.
             EnvironmentFailedError: the environment fails.
         """
         return joined(self.outcomes_in_turn(count, threads, retries)).returns
@@ -156,9 +148,6 @@ class Player(NamedTuple):
         """The same policy, which now observes what an encoder's latent is decoded to.
 
         The return that it loses measures what the latent lacks for acting.
-
-        Raises:
-            InputError: an encoder for other observations, or one that can't decode.
         """
         encoder.check_task(self.task)
         encoder.check_decodes("a policy by its name acts on decoded observations")
@@ -178,10 +167,6 @@ def _progress(steps: int) -> Progress:
 
 
 def check_episodes(count: int) -> None:
-    """Make sure that an evaluation may have so many episodes.
-
-    Raises:
-        InputError: there are more.
-    """
+    """Make sure that an evaluation may have so many episodes."""
     if count > MAX_EPISODES:
         raise InputError(f"{count:,} episodes are too many: at most {MAX_EPISODES:,} are played")

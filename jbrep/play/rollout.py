@@ -30,9 +30,6 @@ class Rollout:
         motion: of the robot, n + 1 states; None where there is no MuJoCo.
         note: why there is no motion though the environment may have one.
         encoder: through which a trained policy observed; None if it observed all features.
-
-    Raises:
-        InputError: an array of another shape.
     """
 
     task: Task
@@ -76,9 +73,6 @@ def replay(dataset: Dataset, episode: int) -> Rollout:
     """An episode of a data set, simulated again for the motion of its robot.
 
     Where that isn't possible here, or leads elsewhere, it is as stored, with a note and no motion.
-
-    Raises:
-        InputError: the data set has no such episode, or it has no steps.
     """
     stored = dataset.episode(episode)
     if not len(stored):

@@ -32,11 +32,7 @@ class Scene(Protocol):
 
 
 def scene_of(rollout: Rollout, camera: Camera) -> Scene:
-    """What can be shown of an episode.
-
-    Raises:
-        InputError: nothing can; or its time step is not known, or it has no such camera.
-    """
+    """What can be shown of an episode."""
     if rollout.note:
         raise InputError(f"{rollout.note}; it can't be filmed, but jbrep inspect shows its signals")
     return Simulated(rollout, camera) if rollout.motion else Drawn(rollout, camera)
@@ -53,7 +49,6 @@ class Simulated:
         self.timestep = rollout.task.known_timestep
 
     def pictures(self, states: Iterable[int]) -> Iterator[Image.Image]:
-        """As for `Scene`."""
         for state in states:
             yield Image.fromarray(self._camera.picture(self._motion, state))
 
@@ -82,11 +77,6 @@ class Drawn:
         self.timestep = task.timestep or (1 / fps if fps else task.known_timestep)
 
     def pictures(self, states: Iterable[int]) -> Iterator[Image.Image]:
-        """As for `Scene`.
-
-        Raises:
-            InputError: played once more, the episode isn't the same; or it can't be drawn.
-        """
         step = 0
         with self._begin() as lanes:
             for state in states:

@@ -35,10 +35,6 @@ def find_episode(
 
     Those under a policy are the episodes of evaluation. A run's come out as they did when it was
     evaluated.
-
-    Raises:
-        InputError: as `find_player`, or there is no such episode, or the data set is of another
-            task.
     """
     if exists(Path(source) / MANIFEST):
         dataset = Dataset(source)
@@ -67,7 +63,6 @@ def find_policy(text: str, folder: Path, task: Task) -> Policy:
         task: of the data set.
 
     Raises:
-        InputError: it names nothing of these, or what it names can't be used.
         DamageError: a file isn't what was written.
     """
     taken: list[str] = []
@@ -111,11 +106,7 @@ def is_by_name(source: str) -> bool:
 
 
 def check_source(source: str) -> None:
-    """Make sure that a source is something to play or replay, without loading it.
-
-    Raises:
-        InputError: it is nothing of these.
-    """
+    """Make sure that a source is something to play or replay, without loading it."""
     if is_trained(source) or is_by_name(source) or exists(Path(source) / MANIFEST):
         return
     check_begun(Path(source))
@@ -131,11 +122,7 @@ def policy_names() -> str:
 
 
 def policy_file(source: str, task: Task | None) -> Path:
-    """The path of the policy's file that a source names: that path, or the one that ships.
-
-    Raises:
-        InputError: none ships for the task, or no task is given.
-    """
+    """The path of the policy's file that a source names: that path, or the one that ships."""
     return shipped.find(_needed(task, source)) if source == SHIPPED else Path(source)
 
 
@@ -148,9 +135,6 @@ def find_player(source: str, task: Task | None = None, encoder: Any = None) -> P
         task: for a policy by its name. A run has its own; if one is given, it must be of the same
             environment, and is played instead: with other arguments or another time limit.
         encoder: the object that a run was made with, if its encoder is a user's own.
-
-    Raises:
-        InputError: neither, or no task for a name, or a run of another task.
     """
     if is_trained(source):
         return _trained(source, task, encoder)
@@ -175,9 +159,6 @@ def find_good_policy(
         source: as `find_player` takes it; None for the hand-written policy, if the task has one.
         task: to act in.
         own_rewards: whether rewards are others than the environment gives: nothing is played then.
-
-    Raises:
-        InputError: as `find_player`, or the policy doesn't act on what it observes.
     """
     if source is None:
         if own_rewards or jitterbug_task(task) is None:
@@ -208,11 +189,7 @@ def run_folder(source: str) -> Path | None:
 
 
 def find_untrained(folder: Path, task: Task) -> Player:
-    """The policy that a run began with, to play a task of the same environment.
-
-    Raises:
-        InputError: the run's files are damaged or inconsistent.
-    """
+    """The policy that a run began with, to play a task of the same environment."""
     from jbrep.rl.policy import load_untrained  # imports torch
 
     return as_player(f"{folder}, before training", load_untrained(folder), task)

@@ -23,11 +23,7 @@ _CHECKSUM = "sha256"  # of the rest of the header and all tensors, in the header
 
 
 def write(path: Path, tensors: Tensors, header: Mapping[str, Any]) -> None:
-    """Write tensors and header with their checksum, whole or not at all.
-
-    Raises:
-        InputError: they can't be written.
-    """
+    """Write tensors and header with their checksum, whole or not at all."""
     write_whole(path, pack(tensors, header))
 
 
@@ -57,7 +53,6 @@ def read(path: Path, what: str, most: int = MAX_BYTES) -> tuple[Tensors, dict[st
         most: bytes that it may have.
 
     Raises:
-        InputError: no such file, or another kind of file.
         DamageError: it isn't what was written, or has no checksum.
     """
     try:
@@ -75,7 +70,6 @@ def unpack(raw: bytes, path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
     """What `pack` made bytes of, as `read` returns it; the path is for messages.
 
     Raises:
-        InputError: another kind of file.
         DamageError: it isn't what was written, or has no checksum.
     """
     try:

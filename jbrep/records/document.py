@@ -51,11 +51,7 @@ class Document(Record, frozen=True):
         return json.dumps(sealed(self.as_json()), indent=self.indent) + "\n"
 
     def write(self, path: Path) -> None:
-        """Write its file, whole or not at all.
-
-        Raises:
-            InputError: it can't be written.
-        """
+        """Write its file, whole or not at all."""
         write_whole(path, self.text().encode())
 
 
@@ -66,18 +62,13 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
     """The document that a JSON file holds, every field checked.
 
     Raises:
-        InputError: the file can't be read, or has another version of the format.
         DamageError: it isn't such a document, or not as it was written.
     """
     return document_in(read_regular(path, kind.max_bytes), path, kind)
 
 
 def document_in(raw: bytes, path: Path, kind: type[_Document]) -> _Document:
-    """The document of these bytes, such as those of a part of a file; the path is for messages.
-
-    Raises:
-        InputError, DamageError: as `read_document`.
-    """
+    """The document of these bytes, such as those of a part of a file; the path is for messages."""
     given = parse_json(raw, path, kind.format)
     stated = given.pop(_HASH, None)
     document = document_from(given, path, kind)
@@ -102,11 +93,7 @@ def sealed(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def document_from(given: Mapping[str, Any], path: Path, kind: type[_Document]) -> _Document:
-    """The same of plain JSON, such as the header of a file; the path is for messages.
-
-    Raises:
-        InputError, DamageError: as `read_document`.
-    """
+    """The same of plain JSON, such as the header of a file; the path is for messages."""
     fields = dict(given)
     if fields.pop("format", None) != kind.format:
         raise DamageError(f"{path} is damaged, or not a {kind.format} file")

@@ -22,9 +22,6 @@ def exclusive(path: Path, *, beside: bool = False, wait: float = 0) -> Iterator[
         path: the folder; with `beside`, a file or folder that may not exist yet.
         beside: whether the lock stands beside the path instead.
         wait: for another process, so many seconds at most.
-
-    Raises:
-        InputError: another process is writing there; the message names it. Or it has no name.
     """
     if beside and not path.name:
         raise InputError(f"{path} can't be a new file or folder: give it a name")

@@ -44,9 +44,6 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """A frozen record whose fields are checked when it is made, in Python or from a file.
 
     A list is taken for a tuple, a whole number for a float, a NumPy scalar for Python's.
-
-    Raises:
-        InputError: a field isn't of its type or out of its range, or `check` says so.
     """
 
     def __post_init__(self) -> None:
@@ -58,11 +55,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         self.check()
 
     def check(self) -> None:
-        """Check what no field can say alone.
-
-        Raises:
-            InputError: fields that don't fit together; the message says why.
-        """
+        """Check what no field can say alone."""
 
     def replace(self, **changes: Any) -> Self:
         """The same with other values of some fields, checked again."""
@@ -76,19 +69,12 @@ def from_plain(value: Any, kind: type[_Kind], where: str = "") -> _Kind:
         value: as json.loads or tomllib.loads return it.
         kind: the class, or another type that msgspec knows.
         where: the value stands, for messages: "data" makes them speak of data.steps.
-
-    Raises:
-        InputError: it doesn't fit; the message names the part, what it is and what it must be.
     """
     return converted(value, kind, where)
 
 
 def from_text(text: str, kind: Any, where: str) -> Any:
-    """A value of a type from text, as people write it: 0.5, or 1,5,10, or size=2,mass=0.5.
-
-    Raises:
-        InputError: as `from_plain`.
-    """
+    """A value of a type from text, as people write it: 0.5, or 1,5,10, or size=2,mass=0.5."""
     parts = [part.strip() for part in text.split(",")]
     match bare(type_of(kind)):
         case inspect.CollectionType():

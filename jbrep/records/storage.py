@@ -24,11 +24,7 @@ class MissingFileError(InputError):
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file atomically: even after a power cut it has all its bytes or doesn't exist.
-
-    Raises:
-        InputError: it can't be written; the message names it and the bytes that are needed.
-    """
+    """Write a file atomically: even after a power cut it has all its bytes or doesn't exist."""
     partial = path.with_name(path.name + _PARTIAL)
     try:
         partial.unlink(missing_ok=True)
@@ -73,11 +69,7 @@ def write_note(path: Path, text: str) -> None:
 
 
 def write_new(path: Path, content: bytes) -> None:
-    """Write a file that doesn't exist yet, as `write_whole`.
-
-    Raises:
-        InputError: it exists, another process is writing it, or it can't be written.
-    """
+    """Write a file that doesn't exist yet, as `write_whole`."""
     with unfinished(path) as partial:
         write_whole(partial, content)
         try:
@@ -95,9 +87,6 @@ def inside(folder: Path, *parts: str) -> Path:
     Args:
         folder: that is jbrep's own.
         parts: names below it, or several at once, as in "runs/full".
-
-    Raises:
-        InputError: one of them is a link, or leads out of the folder.
     """
     path = folder
     for name in Path(*parts).parts:
@@ -112,12 +101,7 @@ def inside(folder: Path, *parts: str) -> Path:
 
 
 def check_plain(folder: Path) -> None:
-    """Make sure that a folder, which may be a stranger's, leads nowhere else and can be read.
-
-    Raises:
-        InputError: something in it is neither a regular file nor a folder, such as a link or a
-            pipe.
-    """
+    """Make sure that a folder, which may be a stranger's, leads nowhere else and can be read."""
     for path in sorted(folder.rglob("*")):
         kind = path.lstat().st_mode
         if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
@@ -145,9 +129,6 @@ def make_folder(folder: Path, own: Collection[str] = ()) -> None:
         folder: to make.
         own: names of what marks a folder as one of those that are to be written, with * for any
             letters; none if it may hold anything.
-
-    Raises:
-        InputError: it can't be made, or is there with other things alone.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -163,11 +144,7 @@ def make_folder(folder: Path, own: Collection[str] = ()) -> None:
 
 
 def check_writable(folder: Path, own: Collection[str] = ()) -> None:
-    """Make a folder unless it exists, and see that files can be written into it.
-
-    Raises:
-        InputError: as `make_folder`; or it can't be written into.
-    """
+    """Make a folder unless it exists, and see that files can be written into it."""
     make_folder(folder, own)
     try:
         with tempfile.TemporaryFile(dir=folder):
@@ -177,22 +154,14 @@ def check_writable(folder: Path, own: Collection[str] = ()) -> None:
 
 
 def check_space(folder: Path, needed: int) -> None:
-    """Make sure that enough bytes are free.
-
-    Raises:
-        InputError: too few are.
-    """
+    """Make sure that enough bytes are free."""
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise _no_space(folder, needed, f"{free:,} are free")
 
 
 def check_allocation(folder: Path, needed: int) -> None:
-    """The same by a file of that size, as a quota or a limit of files would stop it, too.
-
-    Raises:
-        InputError: there can't be one.
-    """
+    """The same by a file of that size, as a quota or a limit of files would stop it, too."""
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             os.posix_fallocate(file.fileno(), 0, needed)
@@ -227,7 +196,6 @@ def read_regular(path: Path, most: int) -> bytes:
 
     Raises:
         MissingFileError: there is none.
-        InputError: it can't be read.
     """
     try:
         file = open_regular(path)
@@ -244,11 +212,7 @@ def read_regular(path: Path, most: int) -> bytes:
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """The same of 1 to `most` bytes.
-
-    Raises:
-        InputError: it can't be read, or is something else.
-    """
+    """The same of 1 to `most` bytes."""
     content = read_regular(path, most)
     if not content:
         raise InputError(f"{path} must be a regular file of 1 to {most:,} bytes")
@@ -260,9 +224,6 @@ def unfinished(path: Path) -> Iterator[Path]:
     """A temporary place beside a new file or folder, for one writer at a time.
 
     What an earlier writer left there is removed first, what this one leaves at the end.
-
-    Raises:
-        InputError: the path exists already, or another process is writing it.
     """
     with exclusive(path, beside=True):
         partial = path.with_name(f".{path.name}.partial")
@@ -276,11 +237,7 @@ def unfinished(path: Path) -> Iterator[Path]:
 
 
 def publish_file(partial: Path, path: Path) -> None:
-    """Bring a file to the disk, then give it its name.
-
-    Raises:
-        InputError: the name has been taken meanwhile.
-    """
+    """Bring a file to the disk, then give it its name."""
     sync(partial)
     try:
         os.link(partial, path)  # unlike a rename, it never replaces a file

@@ -28,11 +28,7 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Write a table, whole or not at all, unless it is there already; returns its SHA-256.
-
-    Raises:
-        InputError: it can't be written.
-    """
+    """Write a table, whole or not at all, unless it is there already; returns its SHA-256."""
     return write_text(path, csv_text(columns, rows))
 
 
@@ -58,7 +54,6 @@ def read_csv(path: Path, columns: Columns, sha256: str | None = None) -> list[tu
         sha256: of the file, if it is known.
 
     Raises:
-        InputError: it can't be read.
         DamageError: it isn't such a table, or has another SHA-256.
     """
     raw = read_regular(path, _MAX_BYTES)
@@ -83,19 +78,12 @@ def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -
 
     Returns:
         Its SHA-256.
-
-    Raises:
-        InputError: it can't be written.
     """
     return write_csv(path, [*map(_column, kind._fields)], ([*map(_cell, row)] for row in rows))
 
 
 def read_rows(path: Path, kind: type[_Row], sha256: str | None = None) -> list[_Row]:
-    """What `write_rows` wrote.
-
-    Raises:
-        InputError, DamageError: as `read_csv`.
-    """
+    """What `write_rows` wrote."""
     cells: dict[type, Callable[[str], Any]] = {str: str, int: count, float: finite}
     columns = {_column(name): cells[of] for name, of in kind.__annotations__.items()}
     return [kind._make(row) for row in read_csv(path, columns, sha256)]

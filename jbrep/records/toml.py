@@ -13,11 +13,7 @@ _MAX_BYTES = 1 << 20
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The contents of a TOML file, or of the one that a link leads to.
-
-    Raises:
-        InputError: it can't be read, is empty or larger than a MiB, or isn't valid TOML.
-    """
+    """The contents of a TOML file, or of the one that a link leads to."""
     is_possible = "\0" not in str(path)  # or else it is refused as it is read
     content = read_file(Path(os.path.realpath(path)) if is_possible else path, _MAX_BYTES)
     try:

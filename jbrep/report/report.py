@@ -86,9 +86,6 @@ def make_report(
         out: folder for the report; the same one if not given.
         evaluations: as for `jbrep.study.tables.add_diagnostics`.
         across_trainers: compare runs of different trainers, too.
-
-    Raises:
-        InputError: as `write_tables`, `add_diagnostics`, `read_tables` and `write_report`.
     """
     out, ran = out or folder, has_runs(folder)
     if not ran:
@@ -125,9 +122,6 @@ def write_report(tables: Tables, out: Path) -> list[Path]:
 
     Returns:
         The paths of the page, the summaries and the folder of the figures.
-
-    Raises:
-        InputError: the report can't be written.
     """
     make_folder(out)
     associated = _associated(tables)

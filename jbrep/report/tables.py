@@ -43,11 +43,7 @@ class Tables(NamedTuple):
 
 
 def check_tables(folder: Path) -> None:
-    """Make sure that a folder has the tables of a study.
-
-    Raises:
-        InputError: it has none.
-    """
+    """Make sure that a folder has the tables of a study."""
     if not exists(folder / RECORD):
         if any(folder.rglob(ENCODER)):
             raise InputError(f"no run in {folder} has ended yet: report them then")
@@ -62,9 +58,6 @@ def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     Args:
         folder: of a study, or any that `jbrep.study.results.write_tables` wrote tables into.
         across_trainers: compare runs of different trainers, too.
-
-    Raises:
-        InputError: there is no study in it, or a file is damaged, missing, or of another version.
     """
     check_tables(folder)
     record = read_document(folder / RECORD, RunsRecord)

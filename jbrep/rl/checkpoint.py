@@ -167,7 +167,6 @@ class CheckpointHeader(Document, frozen=True, kw_only=True):
     counters: Mapping[str, Any]
 
     def check(self) -> None:
-        """As for `Record`."""
         super().check()
         for name in _COUNTERS:
             count = self.counters.get(name, 0)
@@ -179,7 +178,6 @@ def read_checkpoint(path: Path) -> tuple[Tensors, CheckpointHeader]:
     """A run's checkpoint.
 
     Raises:
-        InputError: there is none, or it has another version of the format.
         DamageError: it isn't what was written.
     """
     tensors, header = container.read(path, "checkpoint", MAX_BYTES)
@@ -192,7 +190,6 @@ def run_settings(folder: Path) -> RunSettings:
     Of a checkpoint the header alone is read, as the file can be large.
 
     Raises:
-        InputError: there is no run, or a file has another version of its format.
         DamageError: a file isn't what was written.
     """
     if exists(folder / RUN):
@@ -223,11 +220,7 @@ class CheckpointFile:
         return age >= every * max(1.0, self._took * together / _QUICK)
 
     def read(self) -> Snapshot | None:
-        """The snapshot, the history brought to where it was; None if there is none.
-
-        Raises:
-            InputError: it is damaged, or of other settings or versions.
-        """
+        """The snapshot, the history brought to where it was; None if there is none."""
         if not exists(self.path):
             return None
         tensors, header = read_checkpoint(self.path)
@@ -260,11 +253,7 @@ class CheckpointFile:
 
     @contextmanager
     def resuming(self) -> Iterator[None]:
-        """Name the file where training can't continue from its snapshot.
-
-        Raises:
-            InputError: for what a damaged snapshot or a failing environment raises.
-        """
+        """Name the file where training can't continue from its snapshot."""
         try:
             yield
         except EnvironmentFailedError as error:

@@ -102,9 +102,6 @@ class Controller:
         encoder: what the network sees is its latent.
         acting: what is computed of that.
         action_repeat: calls for which an action is held.
-
-    Raises:
-        InputError: a policy that isn't a chain of layers, as with gSDE.
     """
 
     def __init__(
@@ -142,10 +139,6 @@ class Controller:
         Several robots may be given at once, (n, d), for (n, k), the same until `reset`. A policy
         that was trained with a history keeps it: give what the robot shows now. What is refused
         changes nothing: the next call goes on from the one before.
-
-        Raises:
-            InputError: observations of another size, or that aren't one array; or the action isn't
-                finite, as where an observation isn't.
         """
         try:
             rows = np.asarray(observation, np.float32)
@@ -162,11 +155,7 @@ class Controller:
         return self._held.copy()
 
     def _seen(self, observation: NDArray[np.float32]) -> _Seen:
-        """What follows from an observation; nothing is changed yet.
-
-        Raises:
-            InputError: it is of another size or number of robots, or not finite.
-        """
+        """What follows from an observation; nothing is changed yet."""
         self._check(observation)
         if not self.task.view:
             return _Seen(observation, None)
@@ -215,9 +204,6 @@ def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[La
         settings: of the run.
         inputs: numbers that it sees.
         weights: of the part that acts, by stable-baselines3's names.
-
-    Raises:
-        InputError: it isn't such a chain of layers.
     """
     shape = settings.hyperparameters
     if shape.algorithm_kwargs.get("use_sde") or shape.policy_kwargs.get("use_sde"):
@@ -268,7 +254,6 @@ def load_policy(source: str | Path, encoder: Any = None) -> Controller:
         encoder: the object that the run was made with, if its encoder is a user's own.
 
     Raises:
-        InputError: no run or policy there, or one that can't be taken out; as `load_run`.
         DamageError: a file isn't what was written.
     """
     path = Path(source)
@@ -292,7 +277,6 @@ def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
     """The policy in a file, and its encoder.
 
     Raises:
-        InputError: the encoder is another, or as `Controller`.
         DamageError: a number that it acts by isn't finite.
     """
     settings, weights = file.header.settings, file.weights

@@ -24,9 +24,6 @@ def export(controller: Controller, path: Path, form: str = "onnx") -> None:
         controller: of the policy.
         path: a new file.
         form: onnx, or torch for a program of torch.export (.pt2).
-
-    Raises:
-        InputError: another form, the encoder is code, or the file exists already.
     """
     write = choose(form, _FORMS, "format")
     if not isinstance(controller.encoder, Encoder):

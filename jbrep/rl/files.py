@@ -71,7 +71,6 @@ class RunRecord(Document, frozen=True, kw_only=True):
     policy_sha256: Sha256 | None  # of its policy's file; null if it failed
 
     def check(self) -> None:
-        """As for `Record`."""
         if (self.status == FINISHED) != (self.policy_sha256 is not None):
             raise InputError(f"it has {self.status}, but policy_sha256 is {self.policy_sha256}")
         if EVALUATIONS not in self.tables:
@@ -149,11 +148,7 @@ def is_run(folder: Path) -> bool:
 
 
 def check_begun(folder: Path) -> None:
-    """Make sure that a folder isn't of a run that has only just begun.
-
-    Raises:
-        InputError: it is.
-    """
+    """Make sure that a folder isn't of a run that has only just begun."""
     if exists(folder / ENCODER) and not is_run(folder):
         raise InputError(f"the run in {folder} has no {CHECKPOINT} yet, {SOON}")
 
@@ -176,7 +171,6 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     The last one may have more of them.
 
     Raises:
-        InputError: as `read_run`, or the table is missing.
         DamageError: as `read_run`, or the table isn't what the run wrote.
     """
     path = folder / EVALUATIONS
@@ -202,7 +196,6 @@ def read_infos(folder: Path) -> list[Info]:
     """The numbers of a run's evaluations, to the last bit; nothing where none are told.
 
     Raises:
-        InputError: as `read_run`, or the table is missing.
         DamageError: as `read_run`, or the table isn't what the run wrote.
     """
     sha256 = read_run(folder).tables.get(INFOS)
@@ -224,7 +217,6 @@ def read_run(folder: Path) -> RunRecord:
     """What run.json says of a run that has ended.
 
     Raises:
-        InputError: there is none, or it has another version of the format.
         DamageError: it is damaged or something else.
     """
     path = folder / RUN
@@ -237,7 +229,6 @@ def read_finished(folder: Path) -> tuple[RunRecord, str]:
     """The same of a run that has ended well, and the SHA-256 of its policy's file.
 
     Raises:
-        InputError: as `read_run`, or the run failed.
         DamageError: as `read_run`.
     """
     run = read_run(folder)

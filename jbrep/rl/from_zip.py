@@ -60,9 +60,6 @@ def load_zip(
         trust: whether the files may run code; without it nothing is read.
         vecnormalize: what `VecNormalize.save` wrote, with the statistics by which the policy was
             trained to see.
-
-    Raises:
-        InputError: it isn't trusted, is no such file, or fits neither task nor encoder.
     """
     if not trust:
         raise InputError(

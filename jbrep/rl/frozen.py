@@ -42,12 +42,7 @@ class Frozen:
         return {self.file: self.content}
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        """Act deterministically; nothing is drawn.
-
-        Raises:
-            InputError: it was trained in another task; the actor raises one for actions that are
-                not finite.
-        """
+        """Act deterministically; nothing is drawn."""
         header, trained = _opened(self.file, self.content)
         if task.id != trained.task.id:
             raise InputError(f"{header.run} is of {trained.task.name}, not of {task.name}")
@@ -70,7 +65,6 @@ def freeze(source: str, path: Path, file: str) -> Frozen:
         file: name of the policy's file in the data set.
 
     Raises:
-        InputError: the run has no policy so far, or an encoder that is code.
         DamageError: a file isn't what was written.
     """
     if is_policy_file(path):
@@ -100,7 +94,6 @@ def read_frozen(folder: Path, settings: Mapping[str, Any]) -> Frozen:
     """The policy that a manifest names.
 
     Raises:
-        InputError: it is missing or can't be read.
         DamageError: it isn't the one that the data were collected with.
     """
     path = folder / settings["file"]

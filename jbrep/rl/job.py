@@ -90,9 +90,6 @@ class Job:
         encoder: that the run sees its task through.
         settings: of the run, as run.json has them.
         history: what was recorded so far.
-
-    Raises:
-        InputError: as `Run.settings`.
     """
 
     def __init__(
@@ -118,11 +115,7 @@ class Job:
 
     @property
     def result(self) -> RunRecord | None:
-        """The contents of run.json, if the run has ended.
-
-        Raises:
-            InputError: the folder holds another run.
-        """
+        """The contents of run.json, if the run has ended."""
         if not exists(self.folder / RUN):
             return None
         result = read_run(self.folder)
@@ -152,11 +145,7 @@ class Job:
         return settings.replace(begin_from=_sha256(path)) if has_gone_on else settings
 
     def _check_goes_on(self, before: RunRecord) -> None:
-        """Make sure that a run with fewer steps can go on.
-
-        Raises:
-            InputError: it failed, its checkpoint is gone, or a setting follows a schedule.
-        """
+        """Make sure that a run with fewer steps can go on."""
         what = f"the run of {before.settings.steps:,} steps in {self.folder} can't go on"
         if before.status == FAILED:
             raise InputError(f"{what}: it failed; choose another folder")
@@ -171,11 +160,7 @@ class Job:
             )
 
     def check_can_go_on(self) -> None:
-        """Make sure, before anything is played again, that a run that was stopped can go on.
-
-        Raises:
-            InputError: its environment isn't reproducible.
-        """
+        """Make sure, before anything is played again, that a run that was stopped can go on."""
         if not self.run.task.reproducible and exists(self.folder / CHECKPOINT):
             raise InputError(
                 f"{self.run.task.name} is not reproducible: the run in {self.folder} can't go on "
@@ -184,11 +169,7 @@ class Job:
             )
 
     def clear(self) -> None:
-        """Remove what a run that has ended may have left, if it was killed at the very end.
-
-        Raises:
-            InputError: the folder holds another run.
-        """
+        """Remove what a run that has ended may have left, if it was killed at the very end."""
         if self.result:
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
 
@@ -212,7 +193,6 @@ class Job:
         """Let an untrained agent begin as the run does, and log to TensorBoard and to writers.
 
         Raises:
-            InputError: the policy that the run begins with can't be read, or doesn't fit.
             DamageError: that isn't what was written.
         """
         self.history.start()
@@ -302,10 +282,6 @@ class Job:
 
         Returns:
             The contents of run.json; or what they would be.
-
-        Raises:
-            InputError: the environment failed after a checkpoint that is to be kept, which leaves
-                the run as one that was stopped.
         """
         folder, history = self.folder, self.history
         failure = "" if failed is None else str(failed)

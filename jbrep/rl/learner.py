@@ -31,9 +31,6 @@ class Learner(Record, frozen=True, kw_only=True):
         preset: the base, a key of PRESETS.
         overrides: what is set differently there.
         draws: the values of settings, one of which each seed of a study draws.
-
-    Raises:
-        InputError: the name isn't one.
     """
 
     name: LearnerName
@@ -44,11 +41,7 @@ class Learner(Record, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, name: str) -> "Learner":
-        """The learner that is an algorithm with a preset.
-
-        Raises:
-            InputError: unknown algorithm or preset.
-        """
+        """The learner that is an algorithm with a preset."""
         algorithm, _, preset = name.partition("-")
         get_preset(preset or PAPER, algorithm)
         return cls(name=name, algorithm=algorithm, preset=preset or PAPER)
@@ -57,11 +50,7 @@ class Learner(Record, frozen=True, kw_only=True):
     def given(
         cls, algorithm: str, preset: str, overrides: Mapping[str, Any], name: str = ""
     ) -> "Learner":
-        """The learner of an algorithm with a preset or preset file, and what is set differently.
-
-        Raises:
-            InputError: the preset file can't be used, or the name isn't one.
-        """
+        """The learner of an algorithm with a preset or preset file, and what is set differently."""
         in_file: Mapping[str, Any] = {}
         base, beginning = preset, base_name(algorithm, preset)
         if preset.endswith(_SUFFIX):
@@ -83,9 +72,6 @@ class Learner(Record, frozen=True, kw_only=True):
             table: `base`, an algorithm with or without a preset, by default the name; `preset`, if
                 `base` names none, which may be a file; `draws`, lists of values by setting; and
                 overrides.
-
-        Raises:
-            InputError: a base, preset or setting is unknown, or its value isn't allowed.
         """
         overrides = dict(table)
         draws = _draws(overrides.pop("draws", {}))
@@ -126,11 +112,7 @@ class Learner(Record, frozen=True, kw_only=True):
 
     @property
     def hyperparameters(self) -> Hyperparameters:
-        """The preset's with the overrides, all checked.
-
-        Raises:
-            InputError: an unknown algorithm, preset or setting, or a value that it can't have.
-        """
+        """The preset's with the overrides, all checked."""
         return overridden(self.algorithm, self.preset, self.overrides)
 
     @property
@@ -143,11 +125,7 @@ class Learner(Record, frozen=True, kw_only=True):
 
 
 def _draws(given: Any) -> dict[str, tuple[Any, ...]]:
-    """The values by setting that a table says.
-
-    Raises:
-        InputError: it doesn't.
-    """
+    """The values by setting that a table says."""
     if not isinstance(given, dict) or not all(isinstance(v, list) and v for v in given.values()):
         raise InputError(
             f"draws is {given!r}: it must be a table of lists, such as "
@@ -177,9 +155,6 @@ def read_preset(path: Path, algorithm: str) -> tuple[str, dict[str, Any]]:
 
     It is TOML, with a table for each algorithm: `base`, the preset that it begins with (paper by
     default), and overrides.
-
-    Raises:
-        InputError: no such file, not such a file, or a setting that the algorithm can't have.
     """
     get_preset(PAPER, algorithm)
     tables = read_toml(path)

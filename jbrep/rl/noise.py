@@ -63,7 +63,6 @@ class OrnsteinUhlenbeckNoise(Record, frozen=True, tag_field="kind", tag="ornstei
         return OrnsteinUhlenbeckActionNoise(mean, sigma, self.theta)
 
     def after(self, memory: Memory, steps: int, generator: np.random.RandomState) -> Memory:
-        """As for `NormalNoise`."""
         previous = np.stack(memory)
         pull = self.theta * (self.mean - previous) * _DT
         change = self.sigma * np.sqrt(_DT) * generator.normal(size=previous.shape)
@@ -82,13 +81,11 @@ class ColouredNoise(Record, frozen=True, tag_field="kind", tag="coloured"):
     sigma: _Sigma = 0.2
 
     def make(self, size: int, steps: int) -> "ActionNoise":
-        """As for `NormalNoise`."""
         from jbrep.rl.action_noise import StatefulNoise
 
         return StatefulNoise(partial(self._next, steps=steps), size)
 
     def after(self, memory: Memory, steps: int, generator: np.random.RandomState) -> Memory:
-        """As for `NormalNoise`."""
         return [self._next(each, generator, steps) for each in memory]
 
     def _next(self, memory: Array, generator: np.random.RandomState, steps: int) -> Array:

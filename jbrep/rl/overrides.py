@@ -84,9 +84,6 @@ def overridden(algorithm: str, preset: str, overrides: Mapping[str, Any]) -> Hyp
         preset: a key of PRESETS.
         overrides: by the names of stable-baselines3's parameters, of the algorithm or its policy,
             or of the other fields of `Hyperparameters`.
-
-    Raises:
-        InputError: an unknown algorithm, preset or setting, or a value that it can't have.
     """
     base = get_preset(preset, algorithm)
     if not overrides:
@@ -127,21 +124,13 @@ def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> 
 
 
 def setting_names(algorithm: str) -> list[str]:
-    """What can be set of an algorithm.
-
-    Raises:
-        InputError: unknown algorithm.
-    """
+    """What can be set of an algorithm."""
     own = _OWN if is_off_policy(algorithm) else _OWN - {"noise"}
     return sorted({*_parameters(algorithm), *_policy_parameters(algorithm), *own})
 
 
 def check_shape(algorithm: str, hyperparameters: Hyperparameters) -> Hyperparameters:
-    """Those of hyperparameters, perhaps a stranger's, that decide which weights a policy has.
-
-    Raises:
-        InputError: an unknown argument, or a value that it can't have.
-    """
+    """Those of hyperparameters, perhaps a stranger's, that decide which weights a policy has."""
     of_class = hyperparameters.algorithm_kwargs
     _check_parts(algorithm, hyperparameters.net_arch)
     return Hyperparameters(
@@ -210,11 +199,7 @@ def is_off_policy(algorithm: str) -> bool:
 
 
 def _typed(name: str, value: Any, annotation: Any) -> Any:
-    """The value, if a parameter of that name and type may have it.
-
-    Raises:
-        InputError: it may not.
-    """
+    """The value, if a parameter of that name and type may have it."""
     value = _or_none(value) if types.NoneType in typing.get_args(annotation) else value
     return to_plain(converted(value, _allowed(name, annotation), name))
 

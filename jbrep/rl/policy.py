@@ -43,8 +43,6 @@ def load_run(folder: Path, encoder: Any = None) -> Trained:
             request is known without it.
 
     Raises:
-        InputError: no run there, a failed one, one without a checkpoint so far, or one whose files
-            are inconsistent.
         DamageError: a file isn't what was written.
     """
     if not is_run(folder):
@@ -70,7 +68,6 @@ def load_untrained(folder: Path) -> Trained:
     """The policy that a run began with.
 
     Raises:
-        InputError: as `load_run`.
         DamageError: a file isn't what was written.
     """
     settings = run_settings(folder)
@@ -95,8 +92,6 @@ def run_encoder(folder: Path, settings: RunSettings) -> BaseEncoder:
     """The encoder in a run's folder, or what its code makes.
 
     Raises:
-        InputError: it is code whose module wasn't imported on request, or a user's own object, or
-            it can't be used.
         DamageError: its file isn't what was written.
     """
     if exists(folder / ENCODER):
@@ -115,8 +110,6 @@ def policy_to_begin_with(folder: Path, settings: RunSettings, latent_size: int) 
     That run's folder is given, and the settings and latent size of the one that is to begin.
 
     Raises:
-        InputError: the run in the folder isn't finished, or differs in algorithm, network or in
-            the size of observation, latent or action.
         DamageError: a file of it isn't what was written.
     """
     run, sha256 = read_finished(folder)

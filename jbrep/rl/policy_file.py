@@ -37,7 +37,6 @@ class PolicyFile(NamedTuple):
         """The encoder in it.
 
         Raises:
-            InputError: there is none, as it is code.
             DamageError: it isn't that of the settings.
         """
         settings = self.header.settings
@@ -53,7 +52,6 @@ def read(path: Path, sha256: str = "") -> PolicyFile:
     """Read a policy's file, whose SHA-256 may be known.
 
     Raises:
-        InputError: no such file, another kind of file, or another version of the format.
         DamageError: it isn't what was written, or the file with that hash.
     """
     raw = read_file(path, MAX_BYTES)
@@ -63,10 +61,6 @@ def read(path: Path, sha256: str = "") -> PolicyFile:
 
 
 def unpack(raw: bytes, path: Path) -> PolicyFile:
-    """The same of a file's bytes; the path is for messages.
-
-    Raises:
-        InputError, DamageError: as `read`.
-    """
+    """The same of a file's bytes; the path is for messages."""
     tensors, header = container.unpack(raw, path, "policy")
     return PolicyFile(document_from(header, path, PolicyHeader), tensors, path)

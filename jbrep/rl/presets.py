@@ -74,7 +74,6 @@ class Hyperparameters(Record, frozen=True):
     action_repeat: Annotated[int, Meta(ge=1, le=MAX_REPEAT)] = 1
 
     def check(self) -> None:
-        """As for `Record`."""
         from_plain(self.optimizer_kwargs, _OfAdam, "optimizer_kwargs")
 
     def agent_steps(self, control_steps: int) -> int:
@@ -188,12 +187,7 @@ def usual_preset(algorithm: str) -> str:
 
 
 def get_preset(preset: str, algorithm: str) -> Hyperparameters:
-    """The hyperparameters of an algorithm in the preset of that name.
-
-    Raises:
-        InputError: no preset or algorithm of that name, or the preset has none of that algorithm;
-            the message lists those that there are.
-    """
+    """The hyperparameters of an algorithm in the preset of that name."""
     choose(algorithm, CLASSES, "algorithm")
     of_preset = choose(preset, PRESETS, "preset")
     if algorithm not in of_preset:
@@ -205,11 +199,7 @@ def get_preset(preset: str, algorithm: str) -> Hyperparameters:
 
 
 def sb3_class(algorithm: str) -> "type[BaseAlgorithm]":
-    """The class that has an algorithm in stable-baselines3.
-
-    Raises:
-        InputError: unknown algorithm.
-    """
+    """The class that has an algorithm in stable-baselines3."""
     return cast("type[BaseAlgorithm]", resolve_name(choose(algorithm, CLASSES, "algorithm")))
 
 

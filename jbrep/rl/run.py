@@ -53,9 +53,6 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
         begin_from: the folder of a finished run, whose policy this one begins with.
         registration: SHA-256 of that of its study, if that is registered.
         one_robot: whether there is one instance of the environment, as of a robot that exists once.
-
-    Raises:
-        InputError: a number out of range, or a name that can't be used.
     """
 
     task: Task
@@ -86,19 +83,12 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
                 serves a newcomer best, wide or modern.
             overrides: hyperparameters that are set differently, as with --set.
             others: fields of a run.
-
-        Raises:
-            InputError: an unknown name, or a value that can't be used.
         """
         learner = Learner.given(algorithm, preset or usual_preset(algorithm), overrides)
         return cls(task=as_task(task), learner=learner, **others)
 
     def find_encoder(self) -> BaseEncoder:
-        """The encoder; a user's torch module as the file that is kept of it, if it can be.
-
-        Raises:
-            InputError: it can't be used.
-        """
+        """The encoder; a user's torch module as the file that is kept of it, if it can be."""
         with single_torch_thread():  # as in training, so that a module computes the same bits
             return as_file(find(self.encoder, self.task))
 
@@ -107,10 +97,6 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
 
         Args:
             encoder: what `find_encoder` returns.
-
-        Raises:
-            InputError: an unknown algorithm, preset or setting, a value that it can't have, or a
-                policy that this run can't begin with.
         """
         is_kept_as_code = is_code(self.encoder) and not isinstance(encoder, Encoder)
         trainer, shared = trainer_of(self.learner, self), to_plain(self.training_settings)
@@ -146,11 +132,7 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
 
 
 def trainer_of(learner: Learner, settings: TrainingSettings) -> str:
-    """The trainer of runs of a learner, which can train them.
-
-    Raises:
-        InputError: the one that is named can't, and another could.
-    """
+    """The trainer of runs of a learner, which can train them."""
     trainer = settings.trainer or (COHORT if learner.algorithm in ALGORITHMS else SB3)
     if trainer == COHORT:
         check_for_cohort(learner.algorithm, learner.hyperparameters)

@@ -45,7 +45,6 @@ class SharedSettings(TrainingSettings, frozen=True, kw_only=True):
     device: Literal["cpu", "cuda"]
 
     def check(self) -> None:
-        """As for `Record`."""
         super().check()
         if self.environment.name != self.task:
             raise InputError(f"task is {self.task}, but environment is of {self.environment.name}")

@@ -48,7 +48,6 @@ def train_in_turn(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
     """Bring runs from their start or their checkpoints to their end, one after the other.
 
     Raises:
-        InputError: a checkpoint can't be resumed.
         StoppedError: the session is to stop; the run's checkpoint is written.
     """
     return ((job, _train(job, session)) for job in jobs)
@@ -104,7 +103,6 @@ class _Follower(BaseCallback):
     rollouts, where an agent's state is complete.
 
     Raises:
-        InputError: the checkpoint is damaged, or of other settings or versions.
         StoppedError: (in training) the session is to stop; the checkpoint is written.
     """
 

@@ -106,7 +106,6 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
     ] = "cpu"
 
     def check(self) -> None:
-        """As for `Record`."""
         if 0 < self.final_episodes < self.evaluation_episodes:
             raise InputError(
                 f"final_episodes is {self.final_episodes}: it must be as many as "

@@ -38,11 +38,7 @@ def file_of(task: str) -> Path:
 
 
 def find(task: Task) -> Path:
-    """The file of the policy that ships for a task, whatever its time limit and the robot's body.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The file of the policy that ships for a task, whatever its time limit and body."""
     path = file_of(task.slug)
     if not exists(path):
         ships = ", ".join(sorted(each.stem for each in FOLDER.glob(f"*{POLICY_SUFFIX}")))

@@ -76,7 +76,6 @@ class Trained(NamedTuple):
         """The policy with weights of the part that acts, and with statistics from a file's tensors.
 
         Raises:
-            InputError: the weights don't fit the policy.
             DamageError: a number that it acts by isn't finite, or the statistics are missing.
         """
         fill(acting(self.policy), weights, source)
@@ -110,7 +109,6 @@ def fill(policy: BasePolicy, weights: Tensors, path: Path) -> None:
     """Put weights, by their names, into a policy or its acting part: all it has, and no others.
 
     Raises:
-        InputError: they don't fit the policy.
         DamageError: a weight that the policy acts by is not finite.
     """
     errors = (AttributeError, RuntimeError, TypeError, ValueError)
@@ -121,11 +119,7 @@ def fill(policy: BasePolicy, weights: Tensors, path: Path) -> None:
 
 
 def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
-    """The untrained policy of a run, whose settings are from that path.
-
-    Raises:
-        InputError: the settings can't be those of a run, or the encoder isn't the run's.
-    """
+    """The untrained policy of a run, whose settings are from that path."""
     task = settings.environment
     if encoder.fingerprint != settings.encoder:
         raise InputError(f"{encoder.name} is not the encoder that the run in {path} was made with")
@@ -143,11 +137,7 @@ def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
 
 
 def pack(trained: Trained, run: str) -> bytes:
-    """The bytes of a policy's file, to act with alone; `run` is what its run is called, a line.
-
-    Raises:
-        InputError: its encoder is code, which no file can hold.
-    """
+    """The bytes of a policy's file, to act with alone; `run` is what its run is called, a line."""
     if not isinstance(trained.encoder, Encoder):
         raise InputError(
             f"the policy of {run} can't be kept in a file: its encoder, {trained.encoder.name}, is "

@@ -33,7 +33,6 @@ def train(run: Run, folder: Path, session: Session = _ALONE) -> RunRecord:
         are those of the steps before.
 
     Raises:
-        InputError: as `Run.settings`; or the folder holds another run, or is in use.
         StoppedError: the session's `stop` was true.
     """
     ((_, record),) = train_jobs([Job(run, folder)], session)
@@ -45,9 +44,6 @@ def train_jobs(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
 
     Yields:
         Each run with the contents of its run.json, when it has ended.
-
-    Raises:
-        InputError, StoppedError: as `train`.
     """
     with ExitStack() as stack:
         for job in jobs:

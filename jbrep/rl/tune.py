@@ -89,8 +89,6 @@ def tune(
         The best trial.
 
     Raises:
-        InputError: as `train`; or the folder holds another search, or more trials; or each trial
-            failed.
         StoppedError: `stop` was true.
     """
     settings = run.settings(run.find_encoder())

@@ -94,9 +94,6 @@ def analyse(
             full observation, and none.
         seed: of all resampling.
         references: returns of policies that don't learn, by task and policy.
-
-    Raises:
-        InputError: runs that can't be compared, or would mislead; see jbrep.stats.runs.groups.
     """
     planned = planned or Planned()
     by_group, played = groups(runs, planned.rules.baseline), references or {}

@@ -44,9 +44,6 @@ def common_grid(group: Group) -> tuple[Array, str | None]:
     The grid begins where the last run begins and ends where the first run that didn't fail ends:
     nothing is extrapolated. In between it has the evaluations of the run with the fewest, as more
     would only be interpolated.
-
-    Raises:
-        InputError: the runs have no range of steps in common.
     """
     runs = list(chain.from_iterable(group.values()))
     whole = [run for run in runs if run.failed_at is None]
@@ -153,11 +150,7 @@ class Compared(NamedTuple):
 
 
 def compared(group: Group) -> Compared:
-    """The runs of a group on their common grid.
-
-    Raises:
-        InputError: as `common_grid`.
-    """
+    """The runs of a group on their common grid."""
     grid, cut = common_grid(group)
     curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in group.items()}
     on_all_starts = _end_on_all_starts(group, grid)

@@ -72,9 +72,6 @@ def pair_of(group: Group, x: str, y: str, seeds: Collection[int]) -> Pair | None
         x: one representation.
         y: the other.
         seeds: that count; what a failed run counts as is known from these alone, too.
-
-    Raises:
-        InputError: the runs have no range of steps in common.
     """
     counted = with_failure_returns([r for runs in group.values() for r in runs if r.seed in seeds])
     there = {name: [r for r in counted if r.representation == name] for name in group}

@@ -52,11 +52,7 @@ class Stated(NamedTuple):
 
 
 class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
-    """What is tested, and how strictly: the table `verdicts` of a study's file.
-
-    Raises:
-        InputError: a field is out of its range, or they contradict one another.
-    """
+    """What is tested, and how strictly: the table `verdicts` of a study's file."""
 
     claims: Annotated[
         tuple[str, ...],
@@ -104,11 +100,7 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
 
     @property
     def stated(self) -> list[Stated]:
-        """The claims.
-
-        Raises:
-            InputError: one isn't such a sentence.
-        """
+        """The claims."""
         return [self._read(each) for each in self.claims]
 
     def _read(self, text: str) -> Stated:
@@ -183,11 +175,7 @@ class Planned:
         return self.rules.error / max(1, len(self.rules.chains) * len(self.groups))
 
     def __call__(self, groups: Mapping[Key, Group], seed: int = 0) -> list[Verdict]:
-        """What is found of each claim, on each planned task and algorithm.
-
-        Raises:
-            InputError: runs of a group have no range of steps in common.
-        """
+        """What is found of each claim, on each planned task and algorithm."""
         chains = [
             _Chain(key, x, y, claims, self._pair(key, groups.get(key, {}), x, y), self.share)
             for key in self.groups

@@ -53,9 +53,6 @@ class RunCurve:
         encoder_seed: of the encoder, if the representation has several.
         failure_return: what the run counts as once it has failed; None for the floor.
             `with_failure_returns` sets it for runs that are compared.
-
-    Raises:
-        InputError: a field that doesn't fit this description.
     """
 
     task: str
@@ -209,11 +206,6 @@ def groups(runs: Sequence[RunCurve], baseline: str) -> dict[Key, Group]:
     """Runs by (task, algorithm), then by representation, the baseline first.
 
     The order doesn't depend on that of the runs given. Each run has its failure_return.
-
-    Raises:
-        InputError: there is no run, something else than a run, a group without its baseline,
-            without any evaluation, or with different facts of its task, or a label with one run,
-            with a seed twice, or with different settings; or runs of different trainers.
     """
     by_group: dict[Key, Group] = defaultdict(lambda: defaultdict(list))
     for run in runs:

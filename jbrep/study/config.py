@@ -84,7 +84,6 @@ class Data(Record, frozen=True, kw_only=True):
     ] = ""
 
     def check(self) -> None:
-        """As for `Record`."""
         if bool(self.steps) == bool(self.folder):
             raise InputError("it must have either steps, to collect, or the folder of a data set")
         if self.folder and self.sets not in (None, 1):
@@ -183,7 +182,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     title: Annotated[str, Meta(max_length=200, description="What its report is called.")] = ""
 
     def check(self) -> None:
-        """As for `Record`."""
         super().check()
         force_setattr(self, "data", _read_data(self.data))
         for name in ("tasks", "algorithms", "representations", "seeds"):
@@ -201,11 +199,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         self._check_verdicts()
 
     def learner(self, name: str) -> Learner:
-        """The learner of that name: a preset, or one with settings of its own.
-
-        Raises:
-            InputError: a name or setting is unknown, or a value isn't allowed.
-        """
+        """The learner of that name: a preset, or one with settings of its own."""
         own = self.learners.get(name)
         return _learner(name, own) if own else Learner.of(name)
 
@@ -215,11 +209,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         return self.data or {}
 
     def data_of(self, representation: ByName) -> str:
-        """The name of the data that a representation is made from.
-
-        Raises:
-            InputError: there is none of that name, or it names none of several.
-        """
+        """The name of the data that a representation is made from."""
         if representation.data is None and (
             len(self.named_data) == 1 or representation.kind in UNLEARNED
         ):
@@ -414,12 +404,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
 
 
 def read_study(path: Path) -> Study:
-    """A study from its TOML file.
-
-    Raises:
-        InputError: no such file, invalid TOML, or a name or value that is unknown, missing or out
-            of range.
-    """
+    """A study from its TOML file."""
     if not exists(path):
         raise InputError(f"no study at {path}: it must be a TOML file")
     given = read_toml(path)
@@ -438,9 +423,6 @@ def as_study(given: Mapping[str, Any]) -> Study:
     """A study from parsed TOML or JSON; a number of seeds n stands for the seeds 0 to n - 1.
 
     Tables of algorithms become names and learners, which hold what preset files say.
-
-    Raises:
-        InputError: a name or value is unknown, missing or out of range.
     """
     given = dict(given)
     if type(given.get("seeds")) is int and 0 < given["seeds"] <= _MOST_SEEDS:
@@ -453,11 +435,7 @@ def as_study(given: Mapping[str, Any]) -> Study:
 
 
 def _read_data(given: Mapping[str, Any] | None) -> Mapping[str, Data] | None:
-    """Data by name, from the table of the only one, which has no name, or a table for each.
-
-    Raises:
-        InputError: both are mixed, or as `Data`.
-    """
+    """Data by name, from the table of the only one, which has no name, or a table for each."""
     if given is None:
         return None
     tables = [name for name, value in given.items() if isinstance(value, Mapping | Data)]
@@ -479,11 +457,7 @@ def data_key(name: str) -> str:
 
 
 def _learner(name: str, table: Any) -> Learner:
-    """The learner that a table of algorithms describes.
-
-    Raises:
-        InputError: as `Learner.of_table`.
-    """
+    """The learner that a table of algorithms describes."""
     if not isinstance(table, dict):
         raise InputError(f"algorithms.{name} is {table!r}: it must be a table")
     try:

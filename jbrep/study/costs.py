@@ -43,11 +43,7 @@ class Cost(NamedTuple):
 
 
 def costs(plan: Plan) -> list[Cost]:
-    """What is made before the runs: data, each followed by the encoders that are made from them.
-
-    Raises:
-        InputError: as `prepare`, as far as a trial shows it.
-    """
+    """What is made before the runs: data, each followed by the encoders that are made from them."""
     found = []
     for name, data in plan.study.named_data.items():
         with TemporaryDirectory() as folder:

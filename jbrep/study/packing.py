@@ -51,9 +51,6 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
         plan: of the study.
         workers: how many packs go on at a time.
         width: the most runs in a pack; by default as many as memory holds, and no more than pay.
-
-    Raises:
-        InputError: memory doesn't hold so many runs.
     """
     unfinished = plan.unfinished
     groups, alone = _grouped(plan, unfinished)
@@ -82,11 +79,7 @@ def _grouped(plan: Plan, cells: Iterable[Cell]) -> tuple[_Groups, list[Pack]]:
 def _widest(
     plan: Plan, workers: int, width: int | None, groups: _Groups, alone: Iterable[Pack]
 ) -> int:
-    """The most runs that a pack may have, by memory and by what pays.
-
-    Raises:
-        InputError: as for `packed`.
-    """
+    """The most runs that a pack may have, by memory and by what pays."""
     widest = _WIDEST[plan.device]
     limits = (_most(plan, workers, group[0], size) for (_, _, size), group in groups.items())
     most = min(limits, default=width or widest)
@@ -158,9 +151,6 @@ def forecast(plan: Plan, workers: int | None = None, width: int | None = None) -
         plan: the study.
         workers: how many processes would go on at a time; by default as many as are usual.
         width: the most agents that would learn together in one.
-
-    Raises:
-        InputError: as `run_study`, as far as that is known beforehand.
     """
     check(plan)
     plan.check_folder()

@@ -98,11 +98,7 @@ class Plan:
 
     @property
     def device(self) -> str:
-        """What gradient steps are taken on.
-
-        Raises:
-            InputError: there is no such device.
-        """
+        """What gradient steps are taken on."""
         return str(get_device(self.study.device).type)
 
     def folder_of(self, cell: Cell) -> Path:
@@ -119,11 +115,7 @@ class Plan:
         return [cell for cell in self.cells if not self.has_ended(cell)]
 
     def task(self, name: str) -> Task:
-        """A task with the study's arguments, time limit and domain; its environment is made once.
-
-        Raises:
-            InputError: as `describe`.
-        """
+        """A task with the study's arguments, time limit and domain."""
         study = self.study
         return describe(name, study.environment, study.episode_steps, domain=study.domain or {})
 
@@ -133,11 +125,7 @@ class Plan:
         return cache(lambda name: memory_of_each(self.task(name)))
 
     def run(self, cell: Cell) -> Run:
-        """What to train.
-
-        Raises:
-            InputError: as `describe`, or its representation has no encoder for its task.
-        """
+        """What to train."""
         made = self.encoders(cell.task) if self.study.data else None
         return Run(
             task=self.task(cell.task),
@@ -152,11 +140,7 @@ class Plan:
 
     @property
     def fingerprints(self) -> dict[str, str]:
-        """The SHA-256 of encoders that the study doesn't make, by the name of the run.
-
-        Raises:
-            InputError: one is missing.
-        """
+        """The SHA-256 of encoders that the study doesn't make, by the name of the run."""
         return {
             cell.name: self.run(cell).find_encoder().fingerprint
             for cell in self.cells
@@ -165,11 +149,7 @@ class Plan:
 
     @property
     def policies(self) -> dict[str, str]:
-        """SHA-256 of the files of policies that acted in its data sets, by their paths there.
-
-        Raises:
-            InputError: a data set is damaged.
-        """
+        """SHA-256 of the files of policies that acted in its data sets, by their paths there."""
         manifests = {
             path.parent.relative_to(self.folder): read_manifest(path.parent)
             for path in sorted((self.folder / "data").rglob(MANIFEST))
@@ -203,11 +183,7 @@ class Plan:
         ]
 
     def assigned(self, cells: Iterable[Cell]) -> list[Assigned]:
-        """Runs for a worker.
-
-        Raises:
-            InputError: as `run`.
-        """
+        """Runs for a worker."""
         return [Assigned(cell.name, self.run(cell), self.folder_of(cell)) for cell in cells]
 
     def encoders(self, task: str) -> Path:
@@ -227,12 +203,7 @@ class Plan:
         return inside(self.folder, "data", *([name] if name else []), slug(task), *of_set)
 
     def check_folder(self) -> None:
-        """Check that the folder is free, or holds this study.
-
-        Raises:
-            InputError: it holds another; only tasks, algorithms, representations and seeds may
-                change, of a registered study only seeds be added.
-        """
+        """Check that the folder is free, or holds this study."""
         if self.registration and (differing := self.registration.differences(self.study)):
             raise InputError(
                 f"{self.folder} holds the study registered on {self.registration.date[:10]}, and "
@@ -244,21 +215,13 @@ class Plan:
             )
 
     def begin(self) -> None:
-        """Make the folder, and write what the study is if it is new.
-
-        Raises:
-            InputError: as `check_folder`.
-        """
+        """Make the folder, and write what the study is if it is new."""
         self.check_folder()
         if not exists(self.folder / STUDY):
             self.write()
 
     def write(self) -> None:
-        """Make the folder, and write what the study is.
-
-        Raises:
-            InputError: as `check_folder`.
-        """
+        """Make the folder, and write what the study is."""
         make_folder(self.folder)
         self.check_folder()
         self.study.write(self.folder / STUDY)
@@ -269,11 +232,7 @@ class Plan:
         return any((self.folder / "runs").glob("**/*.*"))
 
     def register(self, registration: Registration) -> None:
-        """Write down what is going to be run.
-
-        Raises:
-            InputError: there are runs already, or something else is registered.
-        """
+        """Write down what is going to be run."""
         if self.registration is None:
             self.check_new()
             self.registration = registration
@@ -285,11 +244,7 @@ class Plan:
             )
 
     def check_new(self) -> None:
-        """Check that there are no runs.
-
-        Raises:
-            InputError: there are.
-        """
+        """Check that there are no runs."""
         if self.has_begun:
             raise InputError(f"{self.folder} has runs: a study is registered before its first run")
 
@@ -309,10 +264,6 @@ def _differing(there: Study, study: Study) -> str:
 
 
 def read_plan(folder: Path) -> Plan | None:
-    """The study in a folder; None if there is none, but at most runs.
-
-    Raises:
-        InputError: its file is damaged, or of another jbrep.
-    """
+    """The study in a folder; None if there is none, but at most runs."""
     path = folder / STUDY
     return Plan(read_document(path, Study), folder) if exists(path) else None

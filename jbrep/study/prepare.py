@@ -34,13 +34,7 @@ from jbrep.study.work import say
 
 
 def check(plan: Plan) -> None:
-    """Check, before anything is collected or trained, that the runs can start.
-
-    Raises:
-        InputError: as `describe` for a task, as `DataSettings` for what is to be collected; no such
-            shipped encoder, a latent size out of range, no data set of the task, or an encoder of
-            the user's that can't be used.
-    """
+    """Check, before anything is collected or trained, that the runs can start."""
     for name in plan.study.tasks:
         task = plan.task(name)
         for made in made_for(plan, name):
@@ -139,9 +133,6 @@ def prepare(plan: Plan, workers: int = 1) -> None:
     Args:
         plan: the study.
         workers: how many processes go on at a time.
-
-    Raises:
-        InputError: as `collect`, `derive` and `Fitter.fit`.
     """
     every = [each for task in plan.study.tasks for each in made_for(plan, task)]
     sources = {each: source_of(plan, each) for each in every}

@@ -131,7 +131,6 @@ class RunsRecord(Document, frozen=True, kw_only=True):
     runs: list[RunFacts]
 
     def check(self) -> None:
-        """As for `Record`."""
         if not self.runs:
             raise InputError("it has no finished run")
         if "jbrep" not in (*self.versions, {})[0]:
@@ -183,9 +182,6 @@ def runs_record(
         folder: of a study, or any folder with runs below it.
         ended: what run.json says of each run that has finished or failed, by folder.
         tables: SHA-256 of the tables of these runs, by their files' names.
-
-    Raises:
-        InputError: a file is damaged.
     """
     order = in_order((run.settings.representation for run in ended.values()), FULL)
     by_label: dict[str, dict[Path, RunRecord]] = {}

@@ -118,7 +118,6 @@ def read_registration(folder: Path) -> Registration | None:
 
     Raises:
         DamageError: the file was changed since, or is damaged.
-        InputError: it is of another jbrep.
     """
     path = folder / REGISTRATION
     return read_document(path, Registration) if exists(path) else None
@@ -130,12 +129,7 @@ def beside(file: Path) -> Path:
 
 
 def find_committed(file: Path, study: Study) -> Registration | None:
-    """The registration beside a study's file; None where there is none and needs to be none.
-
-    Raises:
-        InputError: it isn't in the last commit of the repository that the file lies in, or of
-            another study; or a study with claims has none there.
-    """
+    """The registration beside a study's file; None where there is none and needs to be none."""
     path, in_git = beside(file), in_work_tree(file)
     if not exists(path) and not (in_git and study.has_claims):
         return None

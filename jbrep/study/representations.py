@@ -63,9 +63,6 @@ class Representation(Record, frozen=True, kw_only=True):
             task: name of the run's task.
             seed: of the run.
             made: folder of the encoders that the study trains for the task; None if it trains none.
-
-        Raises:
-            InputError: there is none for that task.
         """
 
     def encoder_seed(self, seed: int) -> int | None:
@@ -92,7 +89,6 @@ class ByName(Representation, frozen=True, kw_only=True):
     data: str | None = None
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
-        """As for `Representation`."""
         if made is None:
             return self.name
         name, _ = self.fits[self.encoder_seed(seed) or 0]
@@ -150,7 +146,6 @@ class ByFile(Representation, frozen=True, kw_only=True):
         return (self.file,) if isinstance(self.file, str) else self.file.values()
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
-        """As for `Representation`."""
         pattern = self.file if isinstance(self.file, str) else self.file.get(task)
         if pattern is None:
             raise InputError(f"representation {self.name} has no file for {task}")
@@ -164,7 +159,6 @@ class ByFile(Representation, frozen=True, kw_only=True):
         return str(of_task if of_task.exists() else path / name)
 
     def encoder_seed(self, seed: int) -> int | None:
-        """As for `Representation`."""
         return seed if any(_SEED in path for path in self._paths) else super().encoder_seed(seed)
 
 
@@ -178,14 +172,12 @@ class ByCode(Representation, frozen=True, kw_only=True):
     code: str
 
     def check(self) -> None:
-        """As for `Record`."""
         if not is_code(self.code):
             raise InputError(f"its code is {self.code!r}, it must be as in mymodule:MyEncoder")
         if self.encoders is not None:
             raise InputError("code makes one encoder: leave out encoders")
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
-        """As for `Representation`."""
         return self.code
 
 
@@ -198,9 +190,6 @@ def read_representation(given: Given, training: Mapping[str, Any]) -> Representa
             many there are, which may also stand beside file or kind, and data, of which they are
             made, which may stand beside kind.
         training: settings of encoders that the study trains, other than the usual.
-
-    Raises:
-        InputError: no such representation, or invalid settings.
     """
     if isinstance(given, str):
         recipe = read_name(given)

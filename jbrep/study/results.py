@@ -57,9 +57,6 @@ def write_tables(folder: Path) -> list[Path]:
 
     Returns:
         The files: every return, what was run, what `info` told, the returns of reference policies.
-
-    Raises:
-        InputError: there is no such run, a file is damaged, or a table can't be written.
     """
     ended, former = _ended(folder), former_record(folder)
     before, played_on = (former.tables, former.tasks) if former else ({}, {})
@@ -95,9 +92,6 @@ def found(
     Returns:
         The statistics, None where there are too few runs, or runs that can't be compared; and what
         there are none of, and why.
-
-    Raises:
-        InputError: a run has returns that it can't have.
     """
     planned = replace(record.planned, prevented=_prevented(record, references))
     runs = _curves(record, returns, references)
@@ -114,11 +108,7 @@ def found(
 
 
 def read_runs(folder: Path) -> list[RunCurve]:
-    """The runs below a folder that have finished or failed.
-
-    Raises:
-        InputError: there is none, or a file of one is damaged.
-    """
+    """The runs below a folder that have finished or failed."""
     ended = _ended(folder)
     references = read_references(folder, table_hashes(folder).get(REFERENCE_RETURNS))
     return _curves(runs_record(folder, ended, {}), _returns(ended), references)

@@ -126,10 +126,6 @@ def run_study(
 
     Returns:
         How many runs crashed.
-
-    Raises:
-        InputError: the folder holds another study, the study's settings can't be used, it isn't
-            registered as it must be, or memory doesn't hold as many agents.
     """
     check(plan)
     workers, unfinished = workers or usual_workers(plan), plan.unfinished
@@ -163,9 +159,6 @@ def register_study(plan: Plan) -> Path:
 
     Returns:
         The registration's file.
-
-    Raises:
-        InputError: the study's settings can't be used, or there are runs already.
     """
     check(plan)
     if plan.file is None:

@@ -168,7 +168,6 @@ def read_references(folder: Path, sha256: str | None) -> References:
         sha256: of the file; None if there was nothing to write.
 
     Raises:
-        InputError: there is no such file.
         DamageError: it isn't what was written.
     """
     found: References = {}
@@ -216,7 +215,6 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
         A line for each task with representations that no evaluation knows.
 
     Raises:
-        InputError: a given folder has no evaluation, or a file is of a newer jbrep.
         DamageError: a file is damaged.
     """
     path, runs = folder / DIAGNOSTICS, folder / RECORD

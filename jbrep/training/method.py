@@ -72,11 +72,7 @@ class Method(Record, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Self:
-        """The method with settings as text, such as 1,5,10, or as values; None for the default.
-
-        Raises:
-            InputError: it doesn't take one, one can't have that value, or one is missing.
-        """
+        """The method with settings as text, such as 1,5,10, or as values; None for the default."""
         kinds = {field.name: field.type for field in fields(cls)}
         if unknown := [name for name in given if name not in kinds]:
             raise InputError(f"{cls.name} takes no {unknown[0]}: leave it out")
@@ -125,19 +121,11 @@ class Method(Record, frozen=True, kw_only=True):
         return {name: value for name, value in plain.items() if name not in USUAL} | unusual
 
     def resolved(self, data: ScaledDataset) -> Self:
-        """The method as the data need it, such as with names of features in place of a pattern.
-
-        Raises:
-            InputError: a setting means nothing there.
-        """
+        """The method as the data need it, such as with names of features in place of a pattern."""
         return self
 
     def check_data(self, data: ScaledDataset) -> None:
-        """Check, before anything is made, that an encoder can be made from the data.
-
-        Raises:
-            InputError: it can't.
-        """
+        """Check, before anything is made, that an encoder can be made from the data."""
 
 
 class Coded(Method, frozen=True, kw_only=True):
@@ -150,7 +138,6 @@ class Coded(Method, frozen=True, kw_only=True):
     codes: Codes = "raw"
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         largest = self.largest(data.size)
         if not data.size or (largest is not None and largest < 1):
             beside = " beside what is kept" if self.keep else ""
@@ -178,7 +165,6 @@ class Network(Coded, frozen=True, kw_only=True):
         force_setattr(self, "architecture", get_architecture(self.architecture).name)
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         super().check_data(data)
         check_size(self.architecture, data.size, self.latent)
 
@@ -187,11 +173,7 @@ class ClosedForm(Method, frozen=True, kw_only=True):
     """A method without training."""
 
     def make(self, data: ScaledDataset) -> Made:
-        """What it makes of scaled data.
-
-        Raises:
-            InputError: the data don't suffice.
-        """
+        """What it makes of scaled data."""
         raise NotImplementedError
 
 
@@ -216,7 +198,6 @@ class Reconstructing(Learned, frozen=True, kw_only=True):
         weights: dict[str, float]
 
     def check_data(self, data: ScaledDataset) -> None:
-        """As for `Method`."""
         super().check_data(data)
         feature_weights(data, self.weights)
 

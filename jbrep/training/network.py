@@ -60,10 +60,6 @@ def get_architecture(name: str) -> Architecture:
     """The architecture of that name.
 
     One's own hidden sizes, as 64x64 or 64,64, give one that is like `deep` otherwise.
-
-    Raises:
-        InputError: the name is unknown; the message lists the architectures. Or a size is out of
-            range.
     """
     if not _SIZES.fullmatch(name):
         choices = {**ARCHITECTURES, "sizes such as 64x64": ARCHITECTURES["deep"]}
@@ -81,9 +77,6 @@ def check_size(name: str, size: int, latent: int) -> None:
         name: of its architecture.
         size: features.
         latent: units.
-
-    Raises:
-        InputError: it is too large.
     """
     architecture = get_architecture(name)
     widths = (size, *architecture.hidden, latent)
@@ -96,11 +89,7 @@ def check_size(name: str, size: int, latent: int) -> None:
 
 
 def check_layers(*parts: Sequence[Layer] | None) -> None:
-    """Make sure that layers fit an encoder's file.
-
-    Raises:
-        InputError: they are too large.
-    """
+    """Make sure that layers fit an encoder's file."""
     every = [layer for part in parts for layer in part or ()]
     needed = _BYTES * sum(layer.weight.size + layer.bias.size for layer in every)
     widest = max((len(layer.bias) for layer in every), default=0)

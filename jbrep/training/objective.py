@@ -83,11 +83,7 @@ class Objective(nn.Module, ABC):
 
 
 def feature_weights(data: ScaledDataset, weights: Mapping[str, float]) -> Tensor | None:
-    """A weight for each number of a scaled row, (size,); None where all are 1.
-
-    Raises:
-        InputError: a weight of an unknown feature or one that isn't encoded, or none above 0.
-    """
+    """A weight for each number of a scaled row, (size,); None where all are 1."""
     values = torch.ones(data.scaler.size)
     for name, weight in weights.items():
         places = data.scaler.places((name,), data.task)

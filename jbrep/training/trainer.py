@@ -53,11 +53,7 @@ class Epoch(NamedTuple):
 
 
 def get_device(name: str) -> torch.device:
-    """The device cpu or cuda; auto is a GPU if there is one.
-
-    Raises:
-        InputError: another name, or there is no GPU.
-    """
+    """The device cpu or cuda; auto is a GPU if there is one."""
     gpu = torch.cuda.is_available()
     if name == "auto":
         return torch.device("cuda" if gpu else "cpu")

@@ -33,9 +33,6 @@ class Windows:
 
     Attributes:
         device: as given.
-
-    Raises:
-        InputError: no episode is longer than the horizon.
     """
 
     def __init__(
@@ -121,9 +118,6 @@ def first_rows(data: ScaledDataset, rows: NDArray[np.int64], horizon: int) -> ND
         data: the data set.
         rows: sorted rows of whole episodes.
         horizon: rows after one.
-
-    Raises:
-        InputError: no episode is longer than the horizon.
     """
     if not horizon:
         return np.arange(len(rows))
@@ -140,11 +134,7 @@ def first_rows(data: ScaledDataset, rows: NDArray[np.int64], horizon: int) -> ND
 
 
 def count_windows(data: ScaledDataset, horizon: int) -> int:
-    """How many windows the training rows have.
-
-    Raises:
-        InputError: they have fewer than two, or the held-out rows have none.
-    """
+    """How many windows the training rows have."""
     first_rows(data, data.test, horizon)
     if (count := len(first_rows(data, data.train, horizon))) < 2:
         raise InputError(

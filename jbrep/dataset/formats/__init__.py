@@ -49,7 +49,6 @@ def load_format(name: str) -> ModuleType:
     """Import what reads and writes a format.
 
     Raises:
-        InputError: an unknown format.
         ModuleNotFoundError: it needs a package that isn't installed.
     """
     return import_module(choose(name, FORMATS, "format"))
@@ -66,10 +65,6 @@ def export(dataset: "Dataset", to: str, out: Path) -> str:
 
     Returns:
         How to open it.
-
-    Raises:
-        InputError: an unknown format, no rows, another ending, something there already, or it can't
-            be written.
     """
     module = load_format(to)
     if out.name and to in _FILES and out.suffix.lower() != f".{to}":
@@ -91,11 +86,7 @@ def export(dataset: "Dataset", to: str, out: Path) -> str:
 
 
 def open_sources(given: Sequence[str], layout: Layout | None = None, missing: str = "") -> Source:
-    """Open what is to be imported together, each as `open_source` does.
-
-    Raises:
-        InputError: two are the same; or as `open_source` and `together`.
-    """
+    """Open what is to be imported together, each as `open_source` does."""
     paths = [Path(each).resolve() for each in given]
     for i, path in enumerate(paths):
         if path in paths[:i]:
@@ -113,7 +104,6 @@ def open_source(given: str, layout: Layout | None = None, missing: str = "") -> 
         missing: what becomes of numbers that are missing in a table, see `without_missing`.
 
     Raises:
-        InputError: there is nothing of the kind, or it can't be read.
         ModuleNotFoundError: its format needs a package that isn't installed.
     """
     module = load_reader(given)
@@ -131,7 +121,6 @@ def load_reader(given: str) -> ModuleType:
     """Import what reads a file or folder, without opening it.
 
     Raises:
-        InputError: there is nothing of the kind.
         ModuleNotFoundError: its format needs a package that isn't installed.
     """
     path = Path(given)
@@ -154,11 +143,7 @@ def load_reader(given: str) -> ModuleType:
 
 
 def together(sources: Sequence[Source]) -> Source:
-    """Several sources as one: the episodes of each in turn.
-
-    Raises:
-        InputError: they differ in what `_ALIKE` says, or in the time from row to row.
-    """
+    """Several sources as one: the episodes of each in turn."""
     first, *others = sources
     for other in others:
         if differs := _difference(first, other):

@@ -12,11 +12,7 @@ from jbrep.errors import refusing
 
 
 def table_of(frame: Any, name: str) -> Table:
-    """A frame of pandas or polars, or whatever else Arrow takes.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """A frame of pandas or polars, or whatever else Arrow takes."""
     with refusing(f"{name} isn't a table", (TypeError, ValueError, pa.ArrowException)):
         columns = dict(frame) if isinstance(frame, Mapping) else frame
         table = pa.table(columns).combine_chunks()

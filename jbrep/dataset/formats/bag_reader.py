@@ -38,11 +38,7 @@ _zstd = ros2.zstd  # type: ignore[attr-defined] # of the standard library or its
 
 @contextmanager
 def opened(path: Path) -> Iterator[AnyReader]:
-    """A reader of a bag; types that the bag doesn't define are those of ROS 2.
-
-    Raises:
-        InputError: it can't be read, or is beyond a limit.
-    """
+    """A reader of a bag; types that the bag doesn't define are those of ROS 2."""
     if path.is_dir() and path.suffix == ".bag":
         raise InputError(f"{path} is a folder, and files of ROS 1 end in .bag: rename it")
     refused = f"{path} can't be read as a bag"
@@ -98,7 +94,6 @@ class _ZstdFile(_zstd.ZstdFile):  # type: ignore[name-defined]
         self._left = _most(os.fstat(file.fileno()).st_size)
 
     def read(self, size: int | None = -1) -> bytes:
-        """As in the class above."""
         some: bytes = super().read(size)
         self._left -= len(some)
         if self._left < 0:
@@ -110,11 +105,6 @@ class _Database(Sqlite3Reader):
     """A database that has nothing but plain tables."""
 
     def open(self) -> None:
-        """As in the class above.
-
-        Raises:
-            InputError: it has others, or SQLite would open another file.
-        """
         path = str(self.path)
         if any(each in path for each in _OF_ADDRESSES):
             raise InputError(f"{path} can't be opened with any of {_OF_ADDRESSES} in it: rename it")
@@ -128,7 +118,6 @@ class _Mcap(mcap.McapReader):
     """A file whose chunks can all be unpacked at once, as they are where their times overlap."""
 
     def open(self) -> None:
-        """As in the class above."""
         super().open()
         total = sum(each.uncompressed_size for each in self.chunks)
         if total > _most(Path(str(self.path)).stat().st_size):

@@ -40,11 +40,7 @@ class _Message(NamedTuple):
 
 
 def open_table(given: str) -> Table:
-    """Open a .bag of ROS 1, an .mcap or .db3, or the folder of a bag of ROS 2.
-
-    Raises:
-        InputError: it can't be read, or its folder has a link or a pipe.
-    """
+    """Open a .bag of ROS 1, an .mcap or .db3, or the folder of a bag of ROS 2."""
     path, columns, unknown, late = Path(given), list[str](), list[str](), dict[str, str]()
     check_plain(path)
     with opened(path) as reader:

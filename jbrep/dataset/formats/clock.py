@@ -39,9 +39,6 @@ class Clock:
         """Number the episodes: a new one where time goes back or is silent for too long.
 
         And where the table says so itself.
-
-        Raises:
-            InputError: an episode comes in two parts.
         """
         number, before, known = 0, dict[str, Array](), set[int]()
         usual: float | None = None  # step, by the first rows

@@ -46,11 +46,7 @@ class _Form(NamedTuple):
 
 
 def open_table(given: str) -> Table:
-    """Open a text file whose first line, but for comments, names the columns.
-
-    Raises:
-        InputError: it can't be read, or names no columns.
-    """
+    """Open a text file whose first line, but for comments, names the columns."""
     path = Path(given)
     form = _form(path)
     schema = pa.schema(

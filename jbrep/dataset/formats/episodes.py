@@ -100,9 +100,6 @@ def whole_episode(where: str, given: Mapping[str, ArrayLike], **once: Any) -> It
         given: by the names of ALIASES; observations may have one row more than the rest: the final
             one.
         once: the final observation and the seed, where they are known.
-
-    Raises:
-        InputError: other lengths or types, an end before the last step, or as `checked`.
     """
     arrays = {name: plain(where, name, values) for name, values in given.items()}
     observation = arrays["observation"]
@@ -130,9 +127,6 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
         where: it is, for messages.
         rows: of its steps.
         once: its final observation, how it ended and its seed, where they are known.
-
-    Raises:
-        InputError: gaps.
     """
     if not len(rows["action"]):
         return
@@ -180,11 +174,7 @@ def _check_steps(where: str, rows: Rows) -> None:
 
 
 def _following(where: str, rows: Rows) -> Array | None:
-    """The observation after the last action, if that is known.
-
-    Raises:
-        InputError: an observation after an action isn't the one before the next.
-    """
+    """The observation after the last action, if that is known."""
     if "next_observation" not in rows:
         return None
     after, before = (
@@ -209,9 +199,6 @@ def check_whole(values: Array, told: Callable[[int], str]) -> None:
     Args:
         values: with rows.
         told: where they stand and what they are called, by the number of a row.
-
-    Raises:
-        InputError: there is one.
     """
     if values.dtype.kind not in "iu":
         return
@@ -235,11 +222,7 @@ def _flat(values: Array) -> NDArray[np.float64]:
 
 
 def single(where: str, what: str, values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Numbers in single precision.
-
-    Raises:
-        InputError: one is beyond that.
-    """
+    """Numbers in single precision."""
     with np.errstate(over="ignore"):
         rounded = values.astype(np.float32)
     if not np.isfinite(rounded).all():
@@ -252,11 +235,7 @@ def single(where: str, what: str, values: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def plain(name: str, what: str, values: ArrayLike) -> Array:
-    """An array with rows.
-
-    Raises:
-        InputError: no such array.
-    """
+    """An array with rows."""
     try:
         array = np.asarray(values)
     except ValueError:
@@ -269,11 +248,7 @@ def plain(name: str, what: str, values: ArrayLike) -> Array:
 
 
 def flags(where: str, name: str, values: Array) -> NDArray[np.bool_]:
-    """Whether each row is such an end.
-
-    Raises:
-        InputError: a value is neither 0 nor 1.
-    """
+    """Whether each row is such an end."""
     if not np.isin(values, (0, 1)).all():
         raise InputError(f"{where} has a {name} that is neither true nor false, 0 nor 1")
     return values.astype(bool)
@@ -286,9 +261,6 @@ def check_names(name: str, roles: Iterable[str], columns: Iterable[str] = ()) ->
         name: of the source, for messages, as are its columns, unless they are named as roles.
         roles: that columns have.
         columns: all that there are.
-
-    Raises:
-        InputError: a column is missing, or nothing tells where an episode ends.
     """
     roles = set(roles)
     for needed in ("observation", "action"):
@@ -307,11 +279,7 @@ def check_names(name: str, roles: Iterable[str], columns: Iterable[str] = ()) ->
 
 
 def check_lengths(name: str, lengths: Mapping[str, int], unit: str = "rows") -> None:
-    """Make sure that all columns are equally long.
-
-    Raises:
-        InputError: two differ.
-    """
+    """Make sure that all columns are equally long."""
     first, expected = next(iter(lengths.items()), ("", 0))
     for what, length in lengths.items():
         if length != expected:
@@ -336,9 +304,6 @@ def check_kind(name: str, what: str, dtype: np.dtype[Any], row: Sequence[int] = 
         what: the column.
         dtype: of its values.
         row: shape of one of its rows.
-
-    Raises:
-        InputError: objects, text, images, discrete actions, or several numbers where one belongs.
     """
     shape = f"{what}s of shape {tuple(row)}"
     if dtype.kind not in "fiub":

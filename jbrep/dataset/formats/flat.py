@@ -39,9 +39,6 @@ def per_episode(name: str, given: Mapping[str, Any]) -> dict[str, Array]:
         name: of the source.
         given: final_observation (episodes, ...), terminated, truncated and seed (episodes,), as far
             as they are known.
-
-    Raises:
-        InputError: one holds what can't be imported, or two are of different lengths.
     """
     arrays = {what: plain(name, what, values) for what, values in given.items()}
     check_arrays(name, arrays, "episodes")
@@ -54,9 +51,6 @@ def own_names(name: str, names: Collection[str]) -> dict[str, str]:
     Args:
         name: of the source.
         names: that it has.
-
-    Raises:
-        InputError: two names for one column.
     """
     own: dict[str, str] = {}
     for column, aliases in ALIASES.items():
@@ -86,10 +80,6 @@ def split(
         known: once for each episode, as of `per_episode`.
         most: rows of an episode.
         parts: makes episodes of the rows of one.
-
-    Raises:
-        InputError: gaps in an episode, one that is too long or in two parts, as many episodes as
-            `known` doesn't have, or as `checked`.
     """
     count, numbers = 0, set[int]()
     for rows in _divided(name, chunks, most):
@@ -169,9 +159,6 @@ def source_of(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) ->
             such an array for each episode; those that are None aren't there.
         once: what `per_episode` takes, likewise.
         name: of the source.
-
-    Raises:
-        InputError: arrays of different lengths, or of a kind that can't be imported.
     """
     given = {what: values for what, values in columns.items() if values is not None}
     known = {what: values for what, values in once.items() if values is not None}

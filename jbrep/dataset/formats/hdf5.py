@@ -47,10 +47,6 @@ def opened(path: Path, *, whole: bool = False) -> Iterator[h5py.File]:
     Args:
         path: of the file.
         whole: whether each array will be read at once, rather than some rows at a time.
-
-    Raises:
-        InputError: it is damaged, also if that shows while it is read; or it has links, or arrays
-            that take much more memory than the file has bytes.
     """
     with refusing(f"{path} can't be read as an HDF5 file"), h5py.File(path) as file:
         if problem := file.visititems_links(partial(_problem, file, whole)):
@@ -109,11 +105,7 @@ class _Part(NamedTuple):
 
 
 def open_table(given: str) -> Table:
-    """Open a file of either layout.
-
-    Raises:
-        InputError: it can't be read, or has neither layout.
-    """
+    """Open a file of either layout."""
     path = Path(given)
     with opened(path) as file:
         demos = _demos(file)

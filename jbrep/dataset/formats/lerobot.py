@@ -43,11 +43,7 @@ _NUMBERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
 def open_table(given: str) -> Table:
-    """Open a data set by its folder.
-
-    Raises:
-        InputError: it can't be read, or has another layout; or a link in place of a file.
-    """
+    """Open a data set by its folder."""
     folder = Path(given)
     check_plain(folder)
     info = _info(folder / INFO)
@@ -129,9 +125,6 @@ def write(dataset: Dataset, out: Path) -> str:
 
     LeRobot has no place for the observation after the last action, and none for the two ways in
     which an episode ends: what is exported lacks them.
-
-    Raises:
-        InputError: it isn't known how long a step lasts.
     """
     fps = 1 / dataset.task.known_timestep
     with unfinished(out) as partial:

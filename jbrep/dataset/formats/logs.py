@@ -58,10 +58,6 @@ def source_of_table(table: Table, given: Layout | None = None, missing: str = ""
         table: to read.
         given: what the user says of its columns, before what its format says.
         missing: what becomes of numbers that are missing, see `without_missing`.
-
-    Raises:
-        InputError: columns that are missing or of other types. Reading raises it with row and
-            column.
     """
     layout = _both(table, given or Layout())
     roles = roles_of(table, layout)

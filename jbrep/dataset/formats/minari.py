@@ -80,7 +80,6 @@ def open_source(given: str) -> Source:
         given: its folder, or its id, to be looked for where Minari keeps its data sets.
 
     Raises:
-        InputError: there is none, or it holds what can't be imported.
         DamageError: it isn't what jbrep exported.
     """
     folder = _folder(given)
@@ -135,8 +134,6 @@ def _check_files(folder: Path) -> Checksums | None:
     """Make sure that all files are inside the folder, and as jbrep exported them, if so.
 
     Raises:
-        InputError: one is no plain file, leads out of the folder, or holds more than it has bytes
-            for.
         DamageError: one isn't what was exported.
     """
     check_plain(folder)
@@ -164,12 +161,7 @@ def _sha256(path: Path) -> str:
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
-    """What the data set says of itself.
-
-    Raises:
-        InputError: it can't be read, or lacks its spaces: Minari would make the environment, which
-            can run code that the data set names.
-    """
+    """What the data set says of itself."""
     path = folder / _METADATA
     raw = read_regular(path, _MAX_BYTES)
     with refusing(f"{path} can't be read", (ValueError, KeyError, TypeError, RecursionError)):

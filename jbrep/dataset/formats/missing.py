@@ -30,9 +30,6 @@ def without_missing(episode: Incoming, missing: str) -> Iterator[Incoming]:
         episode: of n steps.
         missing: skip leaves out the steps that aren't whole, and divides the episode there; hold:3
             has the last number instead, for at most 3 steps in a row; empty if there must be none.
-
-    Raises:
-        InputError: a number isn't finite, and nothing stands for it.
     """
     count = count_missing(episode)
     if not count or not missing:
@@ -46,11 +43,7 @@ def without_missing(episode: Incoming, missing: str) -> Iterator[Incoming]:
 
 
 def check_numbers(episode: Incoming) -> None:
-    """Make sure that 32 bits hold the numbers of an episode.
-
-    Raises:
-        InputError: one isn't finite, or beyond that.
-    """
+    """Make sure that 32 bits hold the numbers of an episode."""
     parts = {"observation": episode.observation, "final observation": episode.final[None]}
     for what, values in {**parts, "action": episode.action, "reward": episode.reward}.items():
         single(episode.where, what, values)

@@ -60,11 +60,7 @@ class _Stored(NamedTuple):
 
 @contextmanager
 def _opened(archive: zipfile.ZipFile, name: str) -> Iterator[_Stored]:
-    """An array of the archive.
-
-    Raises:
-        InputError: it is damaged, also if that shows while it is read; or it has objects.
-    """
+    """An array of the archive."""
     try:
         with archive.open(f"{name}{_SUFFIX}") as file:
             width, read = {
@@ -98,7 +94,6 @@ def open_source(given: str) -> Source:
     """Open an npz file; its large arrays are read some rows at a time.
 
     Raises:
-        InputError: it isn't one, or can't be used; nothing in it is unpickled.
         DamageError: it isn't what jbrep exported.
     """
     path, stored = Path(given), dict[str, _Stored]()

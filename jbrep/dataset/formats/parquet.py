@@ -59,7 +59,6 @@ def open_table(given: str) -> Table:
     """Open a Parquet file, and the one of its episodes if jbrep exported it.
 
     Raises:
-        InputError: it can't be read.
         DamageError: it isn't what was exported.
     """
     path = Path(given)

@@ -152,11 +152,7 @@ def sort_of(kind: pa.DataType) -> str:
 
 
 def roles_of(table: Table, layout: Layout) -> Roles:
-    """Which columns are what, by the layout, or else by their names.
-
-    Raises:
-        InputError: columns that are missing or of other types, or two of one name.
-    """
+    """Which columns are what, by the layout, or else by their names."""
     name, names = table.name, table.schema.names
     if twice := [each for each, n in Counter(names).items() if n > 1]:
         raise InputError(f"{name} has two columns {twice[0]!r}: rename one")
@@ -226,11 +222,7 @@ def is_of_task(table: Table, roles: Roles) -> bool:
 def _matching(
     table: Table, leaves: list[Leaf], names: tuple[str, ...], what: str = "column"
 ) -> list[Leaf]:
-    """Those of such names, in the order of the names and each once.
-
-    Raises:
-        InputError: none has one of the names.
-    """
+    """Those of such names, in the order of the names and each once."""
     own, columns = [each.name for each in leaves], [each.column for each in leaves]
     return [leaves[i] for i in matching(names, own, columns, f"{table.name} has no {what}")]
 
@@ -264,11 +256,7 @@ def _check_types(table: Table, role: str, leaves: list[Leaf], named: bool) -> No
 
 
 def features_of_table(table: Table, leaves: list[Leaf]) -> Iterator[Feature]:
-    """The features by the names and units of their columns.
-
-    Raises:
-        InputError: an angle in another unit.
-    """
+    """The features by the names and units of their columns."""
     shorts = Counter(each.short for each in leaves)
     names = words(each.short if shorts[each.short] == 1 else each.name for each in leaves)
     for each, name in zip(leaves, names, strict=True):

@@ -67,10 +67,6 @@ def write(
         reward: code, as module:function, that gives rewards in place of the source's, (n,), of the
             observations (n, d) and actions (n, k) of an episode, as the data set has them: without
             the offsets of features.
-
-    Raises:
-        InputError: the folder exists already, there are no episodes, they don't fit the task, or
-            they can't be written.
     """
     if missing:
         converted(missing, Missing, "missing")
@@ -166,12 +162,7 @@ def _survey(source: Source, missing: str) -> _Survey:
 
 
 def _check_alike(source: Source, task: Task) -> None:
-    """Refuse features that are named as the task's but are others, and another clock.
-
-    Raises:
-        InputError: features of its names at other places or in other units, or steps of another
-            length.
-    """
+    """Refuse features that are named as the task's but are others, and another clock."""
     for own, each in zip(task.features, source.features, strict=False):
         if each.name != own.name and each.name in task.feature_names:
             raise InputError(

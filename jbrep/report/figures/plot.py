@@ -70,9 +70,6 @@ def write(plots: Iterable[Plot], folder: Path) -> list[Path]:
 
     Returns:
         The paths of the PNG files.
-
-    Raises:
-        InputError: they can't be written, or another process is writing there.
     """
     make_folder(folder)
     pictures = []

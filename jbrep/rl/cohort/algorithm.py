@@ -123,11 +123,7 @@ def optimizer_step(optimizer: Optimizer) -> Iterator[None]:
 
 
 def check(algorithm: str, hyperparameters: Hyperparameters) -> None:
-    """Check that agents of an algorithm with these settings can learn in a cohort.
-
-    Raises:
-        InputError: they can't; the message says why and names the other trainer.
-    """
+    """Check that agents of an algorithm with these settings can learn in a cohort."""
     if algorithm not in ALGORITHMS:
         raise InputError(f"cohorts train {', '.join(ALGORITHMS)}, not {algorithm}: {_INSTEAD}")
     of_class, of_policy = hyperparameters.algorithm_kwargs, hyperparameters.policy_kwargs

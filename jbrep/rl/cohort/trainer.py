@@ -28,7 +28,6 @@ def train_together(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
         Each run, when it ends.
 
     Raises:
-        InputError: a checkpoint can't be resumed.
         StoppedError: the session is to stop; the runs' checkpoints are written.
     """
     groups = defaultdict[_Kind, list[_Begun]](list)
