@@ -34,7 +34,7 @@ from jbrep.errors import DamageError, InputError, choose, differences
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
 from jbrep.records.record import to_plain
-from jbrep.records.storage import check_space, exists, make_folder, read_regular, write_whole
+from jbrep.records.storage import check_space, exists, make_folder, read_file, write_whole
 from jbrep.text import counted
 
 _MAX_SHARDS = 10_000
@@ -258,7 +258,7 @@ def _keep(files: Mapping[str, bytes], folder: Path) -> None:
         path = folder / name
         if not exists(path):
             write_whole(path, content)
-        elif read_regular(path, len(content)) != content:
+        elif read_file(path) != content:
             raise InputError(f"{path} is another policy's file: choose another folder")
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from jbrep.errors import InputError
 from jbrep.records.record import Finite, Record, converted, shown
-from jbrep.records.words import bare, must_be, type_of
 
 Array = NDArray[np.float64]
 
@@ -123,14 +122,7 @@ def read_ranges(given: Mapping[str, Any]) -> dict[str, Any]:
         if name not in kinds:
             raise InputError(f"unknown {shown(name)} in a domain: it must be one of {names}")
         pair = value if isinstance(value, list) else _ends(value)
-        try:
-            ranges[name] = converted(pair, kinds[name], name)
-        except InputError:
-            node: Any = bare(type_of(kinds[name]))
-            number = must_be(node.item_types[0])
-            raise InputError(
-                f"{name} is {shown(value)}: it must be {number}, or a range, as in 1..2"
-            ) from None
+        ranges[name] = converted(pair, kinds[name], name)
     return ranges
 
 

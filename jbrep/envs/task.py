@@ -27,27 +27,11 @@ NARROW_SEEDS: SeedBits = 31  # and of those of others
 MAX_FEATURES = 4096
 _MAX_ACTIONS = 1024
 EpisodeSteps = Annotated[int, Meta(ge=1, le=MAX_EPISODE_STEPS)]
-Word = Annotated[
-    str,
-    Meta(
-        pattern=r"(?a)\A[A-Za-z][\w.-]{0,99}\Z",
-        title="a letter, then letters, digits, '.', '_', '-'",
-    ),
-]
+Word = Annotated[str, Meta(pattern=r"(?a)\A[A-Za-z][\w.-]{0,99}\Z")]
 Id = Annotated[  # no part of a path leads upwards
-    str,
-    Meta(
-        pattern=r"(?a)\A(\w[\w-]{0,99}/)?\w[\w.-]{0,99}\Z",
-        title="letters, digits, '.', '_', '-' as in Namespace/Name-v0",
-    ),
+    str, Meta(pattern=r"(?a)\A(\w[\w-]{0,99}/)?\w[\w.-]{0,99}\Z")
 ]
-_Group = Annotated[
-    str,
-    Meta(
-        pattern=r"(?a)\A([A-Za-z][\w.-]{0,99})?\Z",
-        title="empty, or a letter, then letters, digits, '.', '_', '-'",
-    ),
-]
+_Group = Annotated[str, Meta(pattern=r"(?a)\A([A-Za-z][\w.-]{0,99})?\Z")]
 _Unit = Annotated[str, Meta(max_length=40)]
 Kind = Literal["scalar", "angle", "quaternion", "vector", "offset", "point"]
 Frame = Literal["", "world", "body", "heading"]
@@ -58,13 +42,8 @@ SPATIAL: Mapping[Kind, range] = {  # kinds of several features, a group of their
     "point": range(2, 4),
 }
 _Positive = Annotated[float, Meta(gt=0, le=1e12)]
-_Part = Annotated[str, Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]{1,200}\Z", title="a name")]
-Missing = Annotated[
-    str,
-    Meta(
-        pattern=r"\A(skip|hold:[1-9]\d{0,5})\Z", title="skip, or hold and a number of steps: hold:3"
-    ),
-]
+_Part = Annotated[str, Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]{1,200}\Z")]
+Missing = Annotated[str, Meta(pattern=r"\A(skip|hold:[1-9]\d{0,5})\Z")]
 _Arrays = Mapping[Word, Annotated[int, Meta(ge=1, le=MAX_FEATURES)]]
 _Bounds = Annotated[tuple[Finite, ...], Meta(min_length=1, max_length=_MAX_ACTIONS)]
 

@@ -51,7 +51,7 @@ class Table(Document, frozen=True, kw_only=True):
     """What a policy returns from the same starts in several domains, the first one undisturbed."""
 
     format = "jbrep perturbations"
-    format_version = 1
+    format_version = 2
 
     policy: Line
     task: Id  # its name

@@ -13,10 +13,8 @@ from msgspec import Meta
 _SECONDS = 5
 CHANGES = "+changes"
 Commits = Mapping[
-    Annotated[str, Meta(pattern=r"\A(jbrep|work)\Z", title="jbrep or work")],
-    Annotated[
-        str, Meta(pattern=rf"\A[0-9a-f]{{40,64}}({re.escape(CHANGES)})?\Z", title="a git commit")
-    ],
+    Annotated[str, Meta(pattern=r"\A(jbrep|work)\Z")],
+    Annotated[str, Meta(pattern=rf"\A[0-9a-f]{{40,64}}({re.escape(CHANGES)})?\Z")],
 ]
 
 

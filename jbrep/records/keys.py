@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec import NODEFAULT, UNSET, inspect
 
-from jbrep.records.record import Record, default_of
-from jbrep.records.words import described, type_of
+from jbrep.records.record import Record, default_of, type_of
 
 
 class Key(NamedTuple):
@@ -39,23 +38,23 @@ def keys_of(kind: type[Record]) -> list[Key]:
     """
     node = type_of(kind)
     assert isinstance(node, inspect.StructType)
-    return [
-        Key(
-            each.encode_name,
-            each.name,
-            each.type,
-            field.type,
-            default_of(field),
-            *_words(each.type),
+    keys = []
+    for each, field in zip(node.fields, msgspec.structs.fields(kind), strict=True):
+        told = each.type if isinstance(each.type, inspect.Metadata) else None
+        words = (told and told.extra_json_schema) or {}
+        extra = (told and told.extra) or {}
+        keys.append(
+            Key(
+                each.encode_name,
+                each.name,
+                each.type,
+                field.type,
+                default_of(field),
+                words.get("description", ""),
+                str(extra.get("default", "")),
+            )
         )
-        for each, field in zip(node.fields, msgspec.structs.fields(kind), strict=True)
-    ]
-
-
-def _words(node: inspect.Type) -> tuple[str, str]:
-    """A field's help, and its default in words."""
-    extra = node.extra or {} if isinstance(node, inspect.Metadata) else {}
-    return described(node).get("description", ""), str(extra.get("default", ""))
+    return keys
 
 
 def option_name(key: str) -> str:

@@ -9,12 +9,11 @@ from typing import Any, NamedTuple, TypeVar
 
 from jbrep.errors import DamageError
 from jbrep.records.record import MOST_WHOLE
-from jbrep.records.storage import exists, read_regular, write_whole
+from jbrep.records.storage import exists, read_file, write_whole
 
 _Row = TypeVar("_Row", bound=NamedTuple)
 Columns = Mapping[str, Callable[[str], Any]]  # by their names: what their cells are
 
-_MAX_BYTES = 1 << 28
 _LARGEST = 1e100  # number whose square is one, too
 
 
@@ -35,7 +34,7 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]])
 def write_text(path: Path, text: str) -> str:
     """The same of a table as text."""
     content = text.encode()
-    if not exists(path) or read_regular(path, _MAX_BYTES) != content:
+    if not exists(path) or read_file(path) != content:
         write_whole(path, content)
     return hash_of(text)
 
@@ -56,7 +55,7 @@ def read_csv(path: Path, columns: Columns, sha256: str | None = None) -> list[tu
     Raises:
         DamageError: it isn't such a table, or has another SHA-256.
     """
-    raw = read_regular(path, _MAX_BYTES)
+    raw = read_file(path)
     if sha256 is not None and hashlib.sha256(raw).hexdigest() != sha256:
         raise DamageError(
             f"{path} was changed after it was written, or is damaged: its checksum doesn't match"

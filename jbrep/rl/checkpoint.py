@@ -27,7 +27,6 @@ from jbrep.rl.files import CHECKPOINT, RUN, Episode, Evaluation, Info, read_run
 from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_STEPS
 
-MAX_BYTES = 1 << 40
 PARAMETERS = "parameters."  # begins the names of what gradient steps change
 LANES = "lanes."  # likewise, of what decides how the lanes continue
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")  # of an agent
@@ -180,7 +179,7 @@ def read_checkpoint(path: Path) -> tuple[Tensors, CheckpointHeader]:
     Raises:
         DamageError: it isn't what was written.
     """
-    tensors, header = container.read(path, "checkpoint", MAX_BYTES)
+    tensors, header = container.read(path, "checkpoint")
     return tensors, document_from(header, path, CheckpointHeader)
 
 

@@ -21,7 +21,7 @@ from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError
 from jbrep.machine import cores
 from jbrep.records.commit import commits
-from jbrep.records.storage import exists, inside, read_file, write_whole
+from jbrep.records.storage import exists, read_file, write_whole
 from jbrep.records.tables import write_csv, write_rows
 from jbrep.rl.agent import Evaluator, action_repeat, restore_statistics, statistics_of
 from jbrep.rl.checkpoint import CheckpointFile, History, run_settings
@@ -44,7 +44,7 @@ from jbrep.rl.files import (
     is_run,
     read_run,
 )
-from jbrep.rl.policy_file import MAX_BYTES, read
+from jbrep.rl.policy_file import read
 from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
 from jbrep.rl.run_settings import RunSettings
@@ -200,11 +200,11 @@ class Job:
             path = self.folder / BEGINNING
             if not exists(path) or _sha256(path) != sha256:
                 source = read(Path(self.run.begin_from) / POLICY, sha256).path
-                write_whole(path, read_file(source, MAX_BYTES))
+                write_whole(path, read_file(source))
             policy = read(path, sha256)
             fill_whole(policy, agent.policy)
             restore_statistics(agent, policy.tensors, path)
-        scalars = Scalars(inside(self.folder, "tensorboard"), self.history.first_step)
+        scalars = Scalars(self.folder / "tensorboard", self.history.first_step)
         agent.set_logger(_Logger(self.settings, [scalars, *writers]))
 
     @cached_property
@@ -334,7 +334,7 @@ class Job:
 
 
 def _sha256(path: Path) -> str:
-    return hashlib.sha256(read_file(path, MAX_BYTES)).hexdigest()
+    return hashlib.sha256(read_file(path)).hexdigest()
 
 
 def _cpu() -> str:

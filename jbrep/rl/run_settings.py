@@ -21,10 +21,7 @@ from jbrep.rl.settings import (
     TrainingSettings,
 )
 
-_Algorithm = Annotated[
-    str,
-    Meta(pattern=rf"\A({'|'.join(CLASSES)})\Z", title=f"one of {', '.join(CLASSES)}"),
-]
+_Algorithm = Annotated[str, Meta(pattern=rf"\A({'|'.join(CLASSES)})\Z")]
 
 
 class SharedSettings(TrainingSettings, frozen=True, kw_only=True):

@@ -1,6 +1,7 @@
+from jbrep.records.words import must_be
+
 from jbrep.records.keys import keys_of
 from jbrep.records.record import Record
-from jbrep.records.words import must_be
 
 
 def key_table(kind: type[Record], *, of: str = "", without: tuple[str, ...] = ()) -> str:

@@ -27,7 +27,7 @@ from jbrep.envs.task import Missing, Task
 from jbrep.errors import InputError, Notice, kind_and_line
 from jbrep.progress import Progress
 from jbrep.records.record import converted
-from jbrep.records.storage import check_space, make_folder, publish_folder, unfinished
+from jbrep.records.storage import check_space, make_folder, publish, unfinished
 from jbrep.text import counted, printable
 
 _SHARD_ROWS = 20_000
@@ -89,7 +89,7 @@ def write(
             check_space(folder.parent, settings.steps * settings.row_bytes())
             partial.mkdir()
             manifest = _fill(source, settings, partial)
-            publish_folder(partial, folder)
+            publish(partial, folder)
     except OSError as error:
         raise InputError(f"can't write {folder}: {error.strerror or error}") from error
     return manifest
