@@ -133,7 +133,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         tuple[Seed, ...],
         Meta(
             min_length=1,
-            description="Of the runs.",
+            description="Of the runs, or how many.",
         ),
     ]
     episode_steps: Annotated[

@@ -48,8 +48,7 @@ class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
     @cached_property
     def sha256(self) -> str:
         """SHA-256 of its fields, as canonical JSON: its file has it, so that changes are seen."""
-        canonical = json.dumps(to_plain(self), sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(canonical.encode()).hexdigest()
+        return seal(to_plain(self))
 
     def as_json(self) -> dict[str, Any]:
         return {**super().as_json(), _SEAL: self.sha256}
@@ -125,6 +124,12 @@ class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
         return ["some runs were made by other commits of jbrep's code"]
 
 
+def seal(fields: Mapping[str, Any]) -> str:
+    """SHA-256 of plain JSON in its canonical form."""
+    canonical = json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
 def registration_in(path: Path) -> Registration:
     """What a file says.
 
@@ -132,9 +137,9 @@ def registration_in(path: Path) -> Registration:
         DamageError: the file was changed since it was written, or is damaged.
     """
     given = parse_json(read_file(path), path, Registration.format)
-    seal = given.pop(_SEAL, None)
+    stated = given.pop(_SEAL, None)
     found = document_from(given, path, Registration)
-    if seal != found.sha256:
+    if stated != found.sha256:
         raise DamageError(
             f"{path} was changed after it was written, or is damaged: its checksum doesn't match"
         )
