@@ -14,9 +14,9 @@ from small import assert_same_files
 from jbrep.dataset import DataSettings
 from jbrep.envs import Lanes, describe
 from jbrep.envs.autoreset import AutoresetLanes
+from jbrep.envs.description import with_domain
 from jbrep.envs.domain import Domain, Draws, read_ranges
-from jbrep.envs.randomized import with_domain
-from jbrep.envs.varied import can_be_pushed, put_factors, velocity_after
+from jbrep.envs.physics import can_be_pushed, put_factors, velocity_after
 from jbrep.envs.view import with_view
 from jbrep.play.jitterbug import turn_targets
 from jbrep.play.perturbed import domains_of

@@ -29,7 +29,6 @@ from jbrep.dataset.manifest import (
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined, some_episodes
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.make import is_batched
-from jbrep.envs.task import changed_parts
 from jbrep.errors import DamageError, InputError, choose, differences
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
@@ -265,12 +264,6 @@ def _keep(files: Mapping[str, bytes], folder: Path) -> None:
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
     """Check that going on gives what an uninterrupted run gives."""
     steps, own = wanted.settings.steps, there.settings.steps
-    is_same = there.task.id == wanted.task.id
-    if is_same and (changed := changed_parts(there.task, wanted.task)):
-        raise InputError(
-            f"{folder} holds a data set of {there.task.name} as it was: {changed} changed since; "
-            "put that back, or choose another folder"
-        )
     differing = differences(_flat(there.settings), _flat(wanted.settings))
     if differing and _flat(there.settings) != {**_flat(wanted.settings), "steps": own}:
         raise InputError(

@@ -11,8 +11,8 @@ from gymnasium.spaces.utils import flatten
 from jbrep.coordinates.coordinates import Coordinates
 from jbrep.coordinates.made import Ingredient, System, make_coordinates
 from jbrep.envs.make import action_in, aside, make_env, reason
-from jbrep.envs.mujoco import quarter_turn
 from jbrep.envs.names import spec_of
+from jbrep.envs.physics import quarter_turn
 from jbrep.envs.task import Array, Task
 from jbrep.envs.view import Window
 from jbrep.errors import InputError, Notice, refusing

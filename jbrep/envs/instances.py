@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 import gymnasium
 from gymnasium.wrappers import TimeLimit
 
+from jbrep.envs.disturbed import Varied
 from jbrep.envs.domain import Domain
 from jbrep.envs.make import aside, is_batched, make_env
-from jbrep.envs.names import find_spec
-from jbrep.envs.origin import files_of
+from jbrep.envs.names import files_of, find_spec
 from jbrep.envs.task import Task
-from jbrep.envs.varied import Varied
 from jbrep.errors import InputError, Notice, kind_and_line
 from jbrep.machine import own_memory
 

@@ -13,9 +13,9 @@ from jbrep.envs.make import is_batched, make_batch
 from jbrep.envs.separate import EnvironmentFailedError as EnvironmentFailedError
 from jbrep.envs.separate import Flags as Flags
 from jbrep.envs.separate import Retries as Retries
-from jbrep.envs.separate import Separate, not_the_same
+from jbrep.envs.separate import Separate
 from jbrep.envs.separate import State as State
-from jbrep.envs.task import Array, Task
+from jbrep.envs.task import Array, Task, not_the_same
 from jbrep.envs.view import Seen
 from jbrep.errors import InputError
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jbrep.envs import instances
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
 from jbrep.envs.make import action_in, aside, flattener, number, of_size, reason
-from jbrep.envs.task import Array, Task, most_held
+from jbrep.envs.task import Array, Task, most_held, not_the_same
 from jbrep.errors import InputError, Notice
 
 Flags = NDArray[np.bool_]
@@ -322,11 +322,3 @@ class Separate:
         for env in self.envs:
             if env is not None:
                 instances.give_back(env)
-
-
-def not_the_same(task: Task) -> InputError:
-    """The error where the same seed and actions lead elsewhere."""
-    return InputError(
-        f"{task.name} is not reproducible here, or another than it was: the same seed and actions "
-        "lead to another state, so this can't continue where it stopped"
-    )

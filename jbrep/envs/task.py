@@ -198,8 +198,8 @@ class Task(Record, frozen=True):
             generator with the episode's seed; None if unknown.
         state: the arrays that `info` has of each state, by name, with their widths.
         constants: those that stay the same during an episode.
-        made_from: SHA-256 of the files that its arguments name and of the modules that define it,
-            by the names of arguments and modules; packages have versions instead.
+        files: SHA-256 of the robot's own files: those that its arguments name, and the one that
+            defines its class, by the names of arguments and module; packages have versions instead.
         offsets: of features by name, which are subtracted from what the environment gives, so that
             32 bits hold it: everywhere a feature is what is left.
         missing: what becomes of readings that aren't finite: skip ends an episode before one,
@@ -225,7 +225,7 @@ class Task(Record, frozen=True):
     draws: Annotated[int, Meta(ge=0, lt=1 << 32)] | None = None
     state: _Arrays = {}
     constants: _Arrays = {}
-    made_from: Mapping[_Part, Sha256] | UnsetType = UNSET  # left out of files that have none
+    files: Mapping[_Part, Sha256] | UnsetType = UNSET  # left out of JSON where there are none
     offsets: Mapping[Word, Finite] | UnsetType = UNSET
     missing: Missing | UnsetType = UNSET
     view: View | UnsetType = UNSET
@@ -459,10 +459,9 @@ def _other_features(expected: Sequence[str], actual: Sequence[str]) -> str:
     return "in another order"
 
 
-def changed_parts(there: Task, now: Task) -> str:
-    """Of what is not what it was when an environment was described, for a message; or nothing."""
-    before, after = there.made_from or {}, now.made_from or {}
-    names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
-    return ", ".join(
-        f"{name} ({file})" if (file := now.arguments.get(name)) else name for name in names
+def not_the_same(task: Task) -> InputError:
+    """The error where the same seed and actions lead elsewhere."""
+    return InputError(
+        f"{task.name} is not reproducible here, or another than it was: the same seed and actions "
+        "lead to another state, so this can't continue where it stopped"
     )

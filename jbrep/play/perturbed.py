@@ -5,8 +5,8 @@ from typing import Annotated
 
 from msgspec import UNSET, Meta
 
+from jbrep.envs.description import changeable, with_domain
 from jbrep.envs.domain import NAMES, Domain, read_ranges
-from jbrep.envs.randomized import changeable, with_domain
 from jbrep.envs.task import Id, Task
 from jbrep.errors import InputError
 from jbrep.play.player import Player

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from jbrep.envs.task import Id, Task, changed_parts
+from jbrep.envs.task import Id, Task
 from jbrep.errors import InputError, differences
 from jbrep.records.record import Sha256, to_plain
 from jbrep.rl.presets import LINEAR, Hyperparameters, learns_from
@@ -116,8 +116,6 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
 
     def differing(self, wanted: "RunSettings") -> str:
         """How they differ from those of the run at hand, for a message; empty if they don't."""
-        if changed := changed_parts(self.environment, wanted.environment):
-            return f"{self.task} as it was before {changed} changed"
         return differences(_flat(self), _flat(wanted))
 
 

@@ -32,8 +32,9 @@ from jbrep.dataset.formats.hdf5 import opened
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.rewards import without_range
 from jbrep.dataset.schema import UNKNOWN_SEED, DataSettings
-from jbrep.envs.description import describe, features_of
+from jbrep.envs.description import describe
 from jbrep.envs.names import spec_of
+from jbrep.envs.probe import features_of
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, kind_and_line, listed, refusing
 from jbrep.progress import Progress

@@ -21,8 +21,8 @@ from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
 from jbrep.dataset.verify import range_problems
-from jbrep.envs.description import features_of, with_features
-from jbrep.envs.precision import Signals, precision_problems
+from jbrep.envs.description import with_features
+from jbrep.envs.probe import Signals, features_of, precision_problems
 from jbrep.envs.task import Missing, Task
 from jbrep.errors import InputError, Notice, kind_and_line
 from jbrep.progress import Progress
