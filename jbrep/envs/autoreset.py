@@ -111,12 +111,10 @@ class AutoresetLanes:
 
     @property
     def state(self) -> State:
-        """A copy of what `restore` takes: everything that decides how the lanes continue."""
         own = {"first_seeds": self._seeds.copy(), "episodes": self._episodes.copy()}
         return own | self.lanes.state
 
     def restore(self, state: State) -> None:
-        """Continue from where the state was taken, to the same bits."""
         lanes = dict(state)
         self._seeds = lanes.pop("first_seeds").copy()
         self._episodes = lanes.pop("episodes").copy()

@@ -13,7 +13,7 @@ from msgspec.structs import asdict
 from jbrep.envs import instances
 from jbrep.envs.domain import PHYSICS, SIGNALS, Domain, read_ranges
 from jbrep.envs.lanes import Lanes
-from jbrep.envs.make import aside, creator, is_batched, reason
+from jbrep.envs.make import aside, creator, is_batched
 from jbrep.envs.names import absolute, code_of, files_of, find_spec, spec_of
 from jbrep.envs.physics import can_be_pushed, physics_of
 from jbrep.envs.probe import Signals, precision_problems, probe
@@ -96,7 +96,7 @@ def _describe(
     spec, given = find_spec(name), json.loads(arguments)
     if max_episode_steps is not None:
         converted(max_episode_steps, EpisodeSteps, "the number of steps in an episode")
-    with refusing(f"{spec.id} failed when it was tried", told=reason), aside():
+    with refusing(f"{spec.id} failed when it was tried"), aside():
         own = getattr(creator(spec), "describe", None)
         if own is None:
             return probe(spec.id, given, max_episode_steps)

@@ -50,7 +50,6 @@ class Disturbed:
         return getattr(self._batch, name)
 
     def reset(self, seed: Any, options: Mapping[str, Any]) -> tuple[Array, Any]:
-        """As the batch does."""
         lanes = np.flatnonzero(options["reset_mask"])
         seeds = np.array([seed[lane] for lane in lanes], np.int64)
         self._draws.begin(lanes, seeds)
@@ -69,7 +68,6 @@ class Disturbed:
                 self._drawn[name][lane] = 0 if value is None else value
 
     def step(self, actions: Array) -> tuple[Any, ...]:
-        """As the batch does; of a step that is lost nothing is seen."""
         self._draws.move()
         if self._push and (pushes := self._draws.pushes(self._drawn["push"])).any():
             self._push(pushes)
@@ -98,7 +96,6 @@ class Disturbed:
 
     @property
     def state(self) -> dict[str, Any]:
-        """A copy of what `restore` takes."""
         own = {
             "domain_given": self._given,
             "domain_measured": self._measured,
@@ -109,7 +106,6 @@ class Disturbed:
         return copies | self._draws.state | self._batch.state
 
     def restore(self, state: Mapping[str, Any]) -> tuple[Array, Any]:
-        """As the batch does."""
         own = {name: each for name, each in state.items() if name.startswith("domain_")}
         given, info = self._batch.restore({n: v for n, v in state.items() if n not in own})
         if given.tobytes() != own["domain_given"].tobytes():

@@ -196,7 +196,6 @@ class Draws:
 
     @property
     def state(self) -> dict[str, NDArray[np.int64]]:
-        """A copy of what `restore` takes."""
         return {"domain_seeds": self._seeds.copy(), "domain_steps": self._steps.copy()}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:

@@ -218,7 +218,6 @@ class Lanes:
 
     @property
     def state(self) -> State:
-        """A copy of what `restore` takes."""
         own = {
             "seeds": self._seeds.copy(),
             "steps": self._steps.copy(),
@@ -229,7 +228,6 @@ class Lanes:
         return own | self._batch.state
 
     def restore(self, state: State) -> None:
-        """Continue from where the state was taken, to the same bits."""
         batch = dict(state)
         self._seeds, self._steps = batch.pop("seeds").copy(), batch.pop("steps").copy()
         self.terminated, self.truncated = batch.pop("terminated"), batch.pop("truncated")

@@ -3,20 +3,19 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.envs import instances
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
-from jbrep.envs.make import action_in, aside, flattener, number, of_size, reason
+from jbrep.envs.make import action_in, aside, flattener, number, of_size
 from jbrep.envs.task import Array, Task, most_held, not_the_same
-from jbrep.errors import InputError, Notice
+from jbrep.errors import InputError, Notice, kind_and_line
 
 Flags = NDArray[np.bool_]
 State = dict[str, NDArray[Any]]
-_Actions = list[NDArray[np.float32]]
 _LARGEST = float(np.finfo(np.float32).max)  # that data sets and agents can have
 _NOW, _BEFORE = "", "before_"  # begin the names of what a state has of each lane's episodes
 
@@ -63,11 +62,11 @@ class _MissingError(Exception):
     """A reading is missing, before which the episode is to end."""
 
 
-class _Episode:
+class _Episode(NamedTuple):
     """A lane's episode so far: it follows from the seed and the actions."""
 
-    def __init__(self, seed: int | None = 0):
-        self.seed, self.actions = seed, _Actions()
+    seed: int | None
+    actions: list[NDArray[np.float32]]
 
 
 class Separate:
@@ -106,8 +105,8 @@ class Separate:
         self._infos: list[Mapping[str, Any]] = [{} for _ in range(num_lanes)]
         self._succeeded = np.zeros(num_lanes, np.bool_)  # at any step of the episode so far
         self._active = np.zeros(num_lanes, np.bool_)
-        self._episodes = [_Episode() for _ in range(num_lanes)]
-        self._before = [_Episode() for _ in range(num_lanes)]
+        self._episodes = [_Episode(0, []) for _ in range(num_lanes)]
+        self._before = [_Episode(0, []) for _ in range(num_lanes)]
         self._last = np.zeros((num_lanes, task.size))  # observations of the episodes before
         self._last_reward = np.zeros(num_lanes)  # of the episode under way
         self._held = np.zeros(num_lanes, np.int64)  # steps in a row with missing readings
@@ -122,7 +121,6 @@ class Separate:
     def reset(
         self, seed: Sequence[int | None], options: Mapping[str, Flags]
     ) -> tuple[Array, dict[str, Array]]:
-        """As a vector environment with `reset_mask`."""
         self._make_new_arrays()
         for lane in np.flatnonzero(options["reset_mask"]).tolist():
             if self._episodes[lane].actions:
@@ -133,7 +131,7 @@ class Separate:
 
     def _begin(self, lane: int, seed: int | None) -> None:
         """Begin an episode, if need be with another instance."""
-        self._episodes[lane], self._active[lane] = _Episode(seed), True
+        self._episodes[lane], self._active[lane] = _Episode(seed, []), True
         while True:
             self._held[lane] = self.missing[lane] = self._last_reward[lane] = 0
             self.failed[lane] = False
@@ -141,14 +139,11 @@ class Separate:
                 self.envs[lane] = self.envs[lane] or self._take()
                 with aside():
                     observation, info = self.envs[lane].reset(seed=seed)
-                if not isinstance(info, Mapping):
-                    raise ValueError("too many values to unpack (expected 2")  # old Gym's
                 return self._put(lane, observation, info)
             except Exception as error:
                 self._handle_failure(lane, error)
 
     def step(self, actions: Array) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
-        """As a vector environment."""
         return self._advance(actions, self._active)
 
     def _advance(
@@ -260,13 +255,12 @@ class Separate:
         if not isinstance(error, EnvironmentFailedError):
             error = EnvironmentFailedError(
                 f"{self._task.name} failed at step {len(self._episodes[lane].actions)} of the "
-                f"episode with seed {self._episodes[lane].seed}: {reason(error)}",
+                f"episode with seed {self._episodes[lane].seed}: {kind_and_line(error)}",
                 lane,
             )
         self._retries[lane].failed(error)
 
     def render(self) -> tuple[Any, ...]:
-        """As a vector environment."""
         with aside():
             return tuple(env.render() for env in self.envs)
 
@@ -307,7 +301,7 @@ class Separate:
         self._play(_NOW, state)
         self._last = state[f"{_BEFORE}observation"].copy()
         for lane in np.flatnonzero(~played).tolist():
-            self._before[lane] = _Episode()
+            self._before[lane] = _Episode(0, [])
         return self._observation, self._arrays
 
     def _play(self, prefix: str, state: State) -> None:

@@ -89,7 +89,6 @@ class Window:
 
     @property
     def state(self) -> dict[str, Array]:
-        """A copy of what `restore` takes."""
         return {"window_states": self._states.copy(), "window_actions": self._actions.copy()}
 
     def restore(self, state: dict[str, Array], given: NDArray[Any]) -> Array:
@@ -117,23 +116,19 @@ class Seen:
         return getattr(self._batch, name)
 
     def reset(self, seed: Any, options: Mapping[str, Any]) -> tuple[Array, Any]:
-        """As the batch does."""
         given, info = self._batch.reset(seed=seed, options=options)
         return self._window.begin(np.flatnonzero(options["reset_mask"]), given), info
 
     def step(self, actions: Array) -> tuple[Any, ...]:
-        """As the batch does; what a step that is lost led to isn't seen."""
         given, *others = self._batch.step(actions)
         moved = ~getattr(self._batch, "lost", np.zeros(len(given), np.bool_))
         return self._window.step(moved, actions, given), *others
 
     @property
     def state(self) -> dict[str, Any]:
-        """A copy of what `restore` takes."""
         return self._window.state | self._batch.state
 
     def restore(self, state: Mapping[str, Any]) -> tuple[Array, Any]:
-        """As the batch does."""
         own = self._window.state.keys()
         given, info = self._batch.restore({n: v for n, v in state.items() if n not in own})
         return self._window.restore({name: state[name] for name in own}, given), info

@@ -310,7 +310,6 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
 
     @property
     def state(self) -> dict[str, NDArray[Any]]:
-        """A copy of what `restore` takes; generators are left out, as `reset` can take seeds."""
         return {
             **self.simulation.state,
             "last_observation": self._observation.copy(),
@@ -318,7 +317,6 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> tuple[Observation, dict[str, Any]]:
-        """Continue from where the state was taken, to the same bits; as `reset` else."""
         physics = dict(state)
         self._steps[:] = physics.pop("episode_steps")
         self._observation = physics.pop("last_observation").copy()
@@ -326,7 +324,6 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         return self._view(self._observation), self._info()
 
     def push(self, velocity: Array) -> None:
-        """As `jbrep.jitterbug.simulation.Simulation.push`."""
         self.simulation.push(velocity)
 
     def _restart(self, lanes: Sequence[int], options: Mapping[str, Any] = {}) -> None:

@@ -117,7 +117,6 @@ class Simulation:
 
     @property
     def state(self) -> dict[str, Array]:
-        """A copy of what `restore` takes, (n, ...) each; with `body` if there are other bodies."""
         now = self.readings
         state = {
             "qpos": now.qpos.copy(),

@@ -22,12 +22,10 @@ Commits = Mapping[
 def commits() -> Commits:
     """The last commits of jbrep's code and of the working directory, where git knows them.
 
-    That of a folder is the last one that changed a file there, so that a commit of something else,
-    such as a registration, leaves it as it was. It is 40 hexadecimal digits (64 with SHA-256), with
-    "+changes" after them if files that git tracks differ from it. They are those of the first call
-    in a process.
+    That of a folder is the last one that changed a file there. "+changes" stands after it if files
+    that git tracks differ from it. They are those of the first call in a process.
     """
-    places = {"jbrep": Path(__file__).resolve().parent, "work": Path.cwd()}
+    places = {"jbrep": Path(__file__).resolve().parents[1], "work": Path.cwd()}
     known = {name: _commit(folder) for name, folder in places.items()}
     return MappingProxyType({name: commit for name, commit in known.items() if commit})
 
@@ -45,7 +43,6 @@ def is_committed(path: Path) -> bool:
 
 
 def _commit(folder: Path) -> str:
-    """The last commit that changed a folder; empty if there is none, or no git."""
     if "site-packages" in folder.parts:
         return ""  # installed in an environment that may lie in another project's repository
     commit = _git(folder, "log", "-1", "--format=%H", "--", ".")

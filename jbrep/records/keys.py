@@ -22,13 +22,14 @@ class Key(NamedTuple):
     @property
     def default_shown(self) -> str:
         """The default for a reader; empty where there is none, or it says nothing."""
-        if self.default_in_words or self.default in (NODEFAULT, UNSET, None, ""):
+        value = self.default
+        if self.default_in_words or value in (NODEFAULT, UNSET, None, ""):
             return self.default_in_words
-        if isinstance(self.default, Record | dict | tuple | frozenset):
+        if isinstance(value, Record | dict | tuple | frozenset):
             return ""
-        if isinstance(self.default, bool):
-            return str(self.default).lower()
-        return f"{self.default:,}" if isinstance(self.default, int) else str(self.default)
+        if isinstance(value, bool):
+            return str(value).lower()
+        return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def keys_of(kind: type[Record]) -> list[Key]:

@@ -35,13 +35,11 @@ def read_file(path: Path) -> bytes:
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file atomically: even after a power cut it has all its bytes or is as it was."""
     partial = path.with_name(path.name + _PARTIAL)
-    try:
-        partial.write_bytes(content)
-        publish(partial, path)
-    except OSError as error:
-        raise _failed(path, error) from error
-    finally:
-        with suppress(OSError):
+    with _refusing(path, "can't write"):
+        try:
+            partial.write_bytes(content)
+            publish(partial, path)
+        finally:
             partial.unlink(missing_ok=True)
 
 
@@ -55,12 +53,9 @@ def write_note(path: Path, text: str) -> None:
 
 def write_new(path: Path, content: bytes) -> None:
     """Write a file that doesn't exist yet, as `write_whole`."""
-    with unfinished(path) as partial:
-        try:
-            partial.write_bytes(content)
-            publish(partial, path)
-        except OSError as error:
-            raise _failed(path, error) from error
+    with _refusing(path, "can't write"), unfinished(path) as partial:
+        partial.write_bytes(content)
+        publish(partial, path)
 
 
 @contextmanager
@@ -107,34 +102,24 @@ def exists(path: str | Path) -> bool:
 
 
 def make_folder(folder: Path, own: Collection[str] = ()) -> None:
-    """Make a folder and its parents unless they exist.
+    """Make a folder and its parents unless they exist, and see that files can be written there.
 
     Args:
         folder: to make.
         own: names of what marks a folder as one of those that are to be written, with * for any
             letters; none if it may hold anything.
     """
-    try:
+    with _refusing(folder, "can't write into"):
         folder.mkdir(parents=True, exist_ok=True)
         there = sorted(each.name for each in folder.iterdir())
-    except OSError as error:
-        raise InputError(f"can't make the folder {folder}: {error.strerror or error}") from None
+        with tempfile.TemporaryFile(dir=folder):
+            pass
     # what a killed writer left is nothing yet
     names = [each for each in there if not each.startswith(".") and not each.endswith(_PARTIAL)]
     if own and names and not any(fnmatchcase(name, each) for name in names for each in own):
         raise InputError(
             f"{folder} holds other things, such as {names[0]}: choose a folder that is new or empty"
         )
-
-
-def check_writable(folder: Path, own: Collection[str] = ()) -> None:
-    """Make a folder unless it exists, and see that files can be written into it."""
-    make_folder(folder, own)
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"can't write into {folder}: {error.strerror or error}") from None
 
 
 def check_space(folder: Path, needed: int) -> None:
@@ -151,8 +136,13 @@ def taken(path: Path) -> InputError:
     return InputError(f"{path} exists already: choose another name")
 
 
-def _failed(path: Path, error: OSError) -> InputError:
-    return InputError(f"can't write {path}: {error.strerror or error}")
+@contextmanager
+def _refusing(path: Path, what: str) -> Iterator[None]:
+    """Let what the system refuses be a user's mistake."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{what} {path}: {error.strerror or error}") from error
 
 
 def _remove(path: Path) -> None:
