@@ -20,7 +20,7 @@ from jbrep.coordinates.placing import placed
 from jbrep.dataset import DataSettings
 from jbrep.encoders import find
 from jbrep.envs.description import describe
-from jbrep.envs.mujoco import turned_quaternion
+from jbrep.envs.physics import turned_quaternion
 from jbrep.envs.task import Feature
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError, Notice

@@ -86,7 +86,7 @@ class AutoresetLanes:
         before = self.lanes.steps
         step, reward, non_finite = self._hold(actions)
         lost = self.lanes.steps == before
-        ended, observation, length = self.lanes.ended, step.observation, self.lanes.steps
+        ended, observation, length = ~self.lanes.active, step.observation, self.lanes.steps
         if ended.any():
             numbers = np.flatnonzero(ended).tolist()
             self._episodes[numbers] += 1
