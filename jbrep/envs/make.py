@@ -5,7 +5,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -106,33 +106,6 @@ def of_size(flat: NDArray[Any], size: int) -> NDArray[Any]:
     if flat.shape != (size,):
         raise ValueError(f"it gave an observation of {flat.size} numbers instead of {size}")
     return flat
-
-
-class Step(NamedTuple):
-    """What an environment gives."""
-
-    observation: NDArray[Any]  # flat, (d,)
-    reward: float
-    terminated: bool
-    truncated: bool
-
-
-def random_play(env: gymnasium.Env[Any, Any], seed: int, most: int) -> Iterator[Step]:
-    """The first observation of an episode, and up to so many steps under random actions."""
-    random, flat = np.random.default_rng(seed), flattener(env.observation_space)
-    space: Any = env.action_space
-    size = spaces.utils.flatdim(env.observation_space)
-    observation, info = env.reset(seed=seed)
-    if not isinstance(info, Mapping):
-        raise ValueError("its reset must give an observation and info, as in Gymnasium")
-    yield Step(of_size(np.array(flat(observation)), size), 0.0, False, False)
-    for _ in range(most):
-        action = action_in(space, random.uniform(space.low, space.high))
-        observation, reward, terminated, truncated, _ = env.step(action)
-        ends = bool(number(terminated, "terminated")), bool(number(truncated, "truncated"))
-        yield Step(of_size(np.array(flat(observation)), size), number(reward, "reward"), *ends)
-        if any(ends):
-            break
 
 
 def aside() -> redirect_stdout[Any]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jbrep.envs import instances
 from jbrep.envs.infos import number_of
-from jbrep.envs.make import action_in, random_play
+from jbrep.envs.make import action_in, flattener, number, of_size
 from jbrep.envs.names import find_spec
 from jbrep.envs.physics import physics_of, planar_root, robot_joint
 from jbrep.envs.task import (
@@ -51,7 +51,7 @@ def probe(
     """The task of an environment, and what its features went through."""
     env = instances.take(env_id, arguments, max_episode_steps)
     try:
-        found = _seen(env, env_id, arguments, max_episode_steps)
+        found = _task_of(env, env_id, arguments, max_episode_steps)
     except BaseException:
         instances.discard(env)
         raise
@@ -59,13 +59,13 @@ def probe(
     return found
 
 
-def _seen(
+def _task_of(
     env: Env, env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None
 ) -> "tuple[Task, Signals]":
     action = _checked_action(env_id, env.action_space)
     features = [*features_of(env_id, env.observation_space)]
     spec = find_spec(env_id)
-    episodes = [_play(env, seed) for seed in (0, 1, 0)]  # a fresh instance, and a used one
+    episodes = [[*_play(env, seed, _STEPS)] for seed in (0, 1, 0)]  # a fresh instance, a used one
     limit = max_episode_steps or spec.max_episode_steps
     low, high = _bounds(action)
     timestep = number_of(getattr(env.unwrapped, "dt", None))
@@ -75,71 +75,70 @@ def _seen(
         features=_with_kinds(env, features),
         action_low=tuple(low.tolist()),
         action_high=tuple(high.tolist()),
-        max_episode_steps=limit or _find_limit(env, env_id, [each.length for each in episodes]),
+        max_episode_steps=limit or _find_limit(env, env_id, episodes),
         arguments=dict(arguments),
         timestep=timestep if timestep and timestep > 0 else None,
         solved_return=spec.reward_threshold,
-        terminates=True if any(each.terminated for each in episodes) else None,
-        reproducible=episodes[0].content == episodes[2].content,
+        terminates=True if any(steps[-1].terminated for steps in episodes) else None,
+        reproducible=_content(episodes[0]) == _content(episodes[2]),
         seed_bits=_seed_bits(env),
     )
-    return task, Signals.of([each.observations for each in episodes])
+    return task, Signals.of(
+        [np.array([each.observation for each in steps], float) for steps in episodes]
+    )
 
 
-class _Length(NamedTuple):
-    """How long an episode was played."""
+class _Step(NamedTuple):
+    """What an environment gives."""
 
-    steps: int
-    truncated: bool  # after them
-
-
-class _Played(NamedTuple):
-    """The first steps of an episode under random actions."""
-
-    content: list[bytes]  # of each state, every bit
-    observations: Array  # (n, d)
-    terminated: bool  # by a state
-    length: _Length
+    observation: NDArray[Any]  # flat, (d,)
+    reward: float
+    terminated: bool
+    truncated: bool
 
 
-def _play(env: Env, seed: int) -> _Played:
-    steps = [*random_play(env, seed, _STEPS)]
-    content = [flat.tobytes() + np.array(told).tobytes() for flat, *told in steps]
-    observations = np.array([each.observation for each in steps], np.float64)
-    *_, terminated, truncated = steps[-1]
-    return _Played(content, observations, terminated, _Length(len(steps) - 1, truncated))
+def _play(env: Env, seed: int, most: int, still: bool = False) -> Iterator[_Step]:
+    """The first state of an episode, and up to so many steps, at random or in the middle."""
+    random, flat = np.random.default_rng(seed), flattener(env.observation_space)
+    space: Any = env.action_space
+    size, middle = flatdim(env.observation_space), (space.low + space.high) / 2
+    observation, info = env.reset(seed=seed)
+    if not isinstance(info, Mapping):
+        raise ValueError("its reset must give an observation and info, as in Gymnasium")
+    yield _Step(of_size(np.array(flat(observation)), size), 0.0, False, False)
+    for _ in range(most):
+        action = middle if still else random.uniform(space.low, space.high)
+        observation, reward, terminated, truncated, _ = env.step(action_in(space, action))
+        ends = bool(number(terminated, "terminated")), bool(number(truncated, "truncated"))
+        yield _Step(of_size(np.array(flat(observation)), size), number(reward, "reward"), *ends)
+        if any(ends):
+            break
 
 
-def _find_limit(env: Env, env_id: str, known: Iterable[_Length]) -> int:
+def _content(steps: Sequence[_Step]) -> list[bytes]:
+    """Every bit of each state."""
+    return [flat.tobytes() + np.array(told).tobytes() for flat, *told in steps]
+
+
+def _find_limit(env: Env, env_id: str, known: Iterable[Sequence[_Step]]) -> int:
     """The time limit that an environment keeps by itself, as several episodes show it."""
-    lengths, cut = [*known], list[int]()
+    lengths = [(len(steps) - 1, steps[-1].truncated) for steps in known]
+    cut = list[int]()
     for seed in range(2, 8):
-        is_random = seed % 2  # one that stands still may last longer
-        lengths.append(_length(env, seed, is_random))
-        cut = [each.steps for each in lengths if each.truncated]
-        if cut and is_random:
+        still = seed % 2 == 0  # it may last longer
+        steps = [*_play(env, seed, _LONGEST, still)]
+        lengths.append((len(steps) - 1, steps[-1].truncated))
+        cut = [length for length, truncated in lengths if truncated]
+        if cut and not still:
             break
     if not cut:
         raise InputError(f"{env_id} has no time limit: give one with --episode-steps")
-    if (longest := max(each.steps for each in lengths)) > min(cut):
+    if (longest := max(lengths)[0]) > min(cut):
         raise InputError(
             f"{env_id} has no time limit: it truncated an episode after {min(cut):,} steps, and "
             f"another lasted at least {longest:,}: give one with --episode-steps"
         )
     return min(cut)
-
-
-def _length(env: Env, seed: int, share: float) -> _Length:
-    """How long an episode is, of actions of which a share is random, the rest in the middle."""
-    space: Any = env.action_space
-    random, middle = np.random.default_rng(seed), (space.low + space.high) / 2
-    env.reset(seed=seed)
-    steps, is_over, truncated = 0, False, False
-    while steps < _LONGEST and not is_over:
-        action = middle + share * (random.uniform(space.low, space.high) - middle)
-        _, _, terminated, truncated, _ = env.step(action_in(space, action))
-        steps, is_over = steps + 1, bool(terminated or truncated)
-    return _Length(steps, bool(truncated))
 
 
 def _seed_bits(env: Env) -> SeedBits:
@@ -255,7 +254,7 @@ def _with_kinds(env: Env, features: Sequence[Feature]) -> tuple[Feature, ...]:
     quantities = dict(_quantities(physics.model))
     observations, states = [], []
     for episode in range(_KIND_EPISODES):
-        for step in islice(random_play(env, episode, _KIND_STEPS), 1, None):
+        for step in islice(_play(env, episode, _KIND_STEPS), 1, None):
             observations.append(step.observation)
             data = physics_of(env).data  # type: ignore[union-attr] # it may be another after a reset
             states.append(np.concatenate((data.qpos, data.qvel)))

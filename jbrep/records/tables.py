@@ -50,7 +50,9 @@ def read_csv(path: Path, columns: Columns, sha256: str | None = None) -> list[tu
     """
     raw = read_file(path)
     if sha256 is not None and hashlib.sha256(raw).hexdigest() != sha256:
-        raise DamageError(f"{path} was changed or is damaged: its checksum doesn't match")
+        raise DamageError(
+            f"{path} was changed after it was written, or is damaged: its checksum doesn't match"
+        )
     try:
         header, *rows = csv.reader(io.StringIO(raw.decode(), newline=""), strict=True)
         if header != [*columns]:
