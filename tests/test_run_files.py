@@ -17,7 +17,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from jbrep.encoders import find, save
 from jbrep.envs import describe
-from jbrep.errors import InputError
 from jbrep.play.sources import find_player
 from jbrep.records import container
 from jbrep.records.record import to_plain
@@ -29,16 +28,12 @@ from jbrep.rl.files import (
     POLICY,
     POLICY_ZIP,
     RUN,
-    PolicyHeader,
-    is_policy_file,
     read_evaluations,
     read_run,
 )
 from jbrep.rl.job import Scalars
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_file import read
-from jbrep.rl.trained import of_file
-from jbrep.study.results import write_tables
 
 TASK = describe("face_direction")
 SETTINGS = Run.of(
@@ -107,49 +102,35 @@ def shorten(folder, episode_steps=30, **others):
     change(folder, settings={**settings, "environment": environment, **others})
 
 
-ODD = (None, True, -1, 1.5, 10**30, float("nan"), "", "x", "\x1b[2J", "../../up", [], {"x": 10**30})
+def changed(record, path, value):
+    """The record with a field, of settings and their parts too, missing or of another value."""
+    mutant = json.loads(json.dumps(record))
+    *parents, name = path
+    parent = functools.reduce(operator.getitem, parents, mutant)
+    parent[name] = value
+    if value is ...:
+        del parent[name]
+    return mutant
 
 
-def mutations(record):
-    """The record with each field, of settings and their parts too, missing or of odd values."""
-    settings = record["settings"]
-    paths = [(name,) for name in record] + [("settings", name) for name in settings]
-    for part in ("environment", "hyperparameters"):
-        paths += [("settings", part, name) for name in settings[part]]
-    for path in paths:
-        for value in (..., *ODD):
-            mutant = json.loads(json.dumps(record))
-            parent = functools.reduce(operator.getitem, path[:-1], mutant)
-            if value is ...:
-                del parent[path[-1]]
-            else:
-                parent[path[-1]] = value
-            yield mutant
-
-
-def attempt(use, folder):
-    """What it gives; None if it refuses, in one line."""
-    try:
-        return use(folder)
-    except InputError as error:
-        message = str(error)
-    assert message.isprintable()
-    return None
-
-
-def test_every_field_of_a_run_is_checked(run):
-    """Whatever run.json says, it is refused in one line, or can be used by all who read it."""
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("steps",), ...),
+        (("status",), "x"),
+        (("tables",), {}),
+        (("settings", "seed"), -1),
+        (("settings", "environment", "id"), "../../up"),
+        (("settings", "hyperparameters", "num_envs"), 10**30),
+    ],
+    ids=str,
+)
+def test_a_field_of_a_run_that_cant_be_is_named(path, value, run):
     record = json.loads((run / RUN).read_text())
-    known = {None, read_run(run).text()}
-    for mutant in mutations(record):
-        forge(run / RUN, mutant)
-        content = attempt(read_run, run)
-        text = content and content.text()
-        if text not in known:
-            known.add(text)
-            attempt(load_run, run)
-            attempt(write_tables, run)
-    assert 20 < len(known) < 100  # most are refused
+    forge(run / RUN, changed(record, path, value))
+    told = refused(read_run, run)
+    assert RUN in told
+    assert path[-1] in told
 
 
 @pytest.mark.parametrize("content", [b"[]", b'{"format": "jbrep run", "format_version": 5}'])
@@ -217,15 +198,11 @@ def test_a_policy_s_file_that_is_none(make, run):
     assert POLICY in refused(load_run, run)
 
 
-def test_every_field_of_a_policy_s_header_is_checked(run):
+@pytest.mark.parametrize(("name", "value"), [("settings", {}), ("step", -1), ("finished", "x")])
+def test_a_field_of_a_policy_s_header_that_cant_be_is_named(name, value, run):
     tensors, header = container.read(run / POLICY, "policy")
-    allowed = {"finished": [True], "run": ["", "x", "../../up"], "step": [0]}
-    for name in header:
-        for value in (..., *ODD):
-            other = {key: each for key, each in {**header, name: value}.items() if each is not ...}
-            container.write(run / POLICY, tensors, other)
-            used = attempt(lambda path: of_file(read(path)), run / POLICY)
-            assert (used is None) == (value not in allowed.get(name, [])), (name, value)
+    container.write(run / POLICY, tensors, {**header, name: value})
+    assert name in refused(read, run / POLICY)
 
 
 def test_weights_too_large_to_act_with_are_refused(run):
@@ -373,15 +350,6 @@ def test_another_encoder_is_not_the_run_s(run):
     pose = {"task": "move_to_pose", "environment": to_plain(describe("move_to_pose"))}
     change(run, settings={**settings, "encoder": own, **pose})
     assert "was made for face_direction" in refused(load_run, run)
-
-
-def test_a_large_policy_is_recognised(tmp_path):
-    path = tmp_path / "large.safetensors"
-    weights = {"policy.weight": np.zeros((2200, 2200), np.float32)}  # 19 MB
-    container.write(path, weights, {"format": PolicyHeader.format})
-    assert is_policy_file(path)
-    path.write_bytes(path.read_bytes()[:100])
-    assert not is_policy_file(path)
 
 
 def test_tensorboard_keeps_what_was_logged_at_the_step_of_a_checkpoint(tmp_path):

@@ -100,7 +100,7 @@ def _line(message: str, value: Any, kind: Any, where: str) -> str:
     place = f"{where}{path}".removeprefix(".")
     nodes = [*_plain([type_of(kind)])]
     for field, index in _STEP.findall(path):
-        nodes = [*_plain(part for each in nodes for part in _parts(each, field))]
+        nodes = [*_plain(part for each in nodes for part in _parts(each, field or index))]
         value = _inside(value, field or index)
     if field := _FIELD.fullmatch(reason):
         name = f"{place}.{field[2]}" if place else field[2]
@@ -138,12 +138,15 @@ def _plain(nodes: Iterable[inspect.Type]) -> Iterator[inspect.Type]:
                 yield node
 
 
-def _parts(node: inspect.Type, field: str) -> list[inspect.Type]:
-    """The types that a part of a value may have, of that field or at any place."""
+def _parts(node: inspect.Type, step: str) -> list[inspect.Type]:
+    """The types that a part of a value may have, of that field or at that place."""
     match node:
-        case inspect.StructType(fields=fields, tag_field=tag_field, tag=tag):
-            own = [each.type for each in fields if each.encode_name == field]
-            return [inspect.LiteralType((tag,))] if field and field == tag_field else own
+        case inspect.StructType(array_like=True, fields=fields):
+            return [fields[int(step)].type]
+        case inspect.StructType(tag_field=tag_field, tag=tag) if step == tag_field:
+            return [inspect.LiteralType((tag,))]
+        case inspect.StructType(fields=fields):
+            return [each.type for each in fields if each.encode_name == step]
         case inspect.CollectionType(item_type=item) | inspect.DictType(value_type=item):
             return [item]
     return []
