@@ -212,7 +212,7 @@ def test_what_is_no_module_or_has_hooks_or_a_bad_name_is_refused():
         Encoder.from_torch(hooked, TASK)
     with pytest.raises(InputError, match="function isn't a torch module"):
         Encoder.from_torch(lambda x: x, TASK)
-    with pytest.raises(InputError, match="name is 'My net': it must be lower-case"):
+    with pytest.raises(InputError, match="name is 'My net'"):
         Encoder.from_torch(nn.Linear(16, 3), TASK, name="My net")
 
 

