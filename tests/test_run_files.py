@@ -39,10 +39,10 @@ from jbrep.rl.files import (
     read_run,
 )
 from jbrep.rl.from_zip import load_zip
-from jbrep.rl.job import Scalars
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_file import read
 from jbrep.rl.trained import of_file
+from jbrep.rl.training import Scalars
 from jbrep.study.results import write_tables
 
 TASK = describe("face_direction")

@@ -55,7 +55,7 @@ class RunRecord(Document, frozen=True, kw_only=True):
     """run.json: a run that has ended."""
 
     format = "jbrep run"
-    format_version = 5
+    format_version = 6
     max_bytes = 1 << 22
 
     status: Literal["finished", "failed"]
@@ -89,7 +89,7 @@ class PolicyHeader(Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep policy"
-    format_version = 4
+    format_version = 5
 
     settings: RunSettings
     encoder: dict[str, Any] | None

@@ -117,7 +117,7 @@ class RunsRecord(Document, frozen=True, kw_only=True):
     """runs.json."""
 
     format = "jbrep runs"
-    format_version = 3
+    format_version = 4
     max_bytes = 1 << 28
     indent = 1
 
