@@ -3,7 +3,7 @@
 import time
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,9 @@ from jbrep.evaluate.evaluation import EVALUATION, Evaluation, Score, Worth, scor
 from jbrep.machine import cores
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
-from jbrep.rl.files import FAILED, RunRecord, last_returns, read_evaluations
-from jbrep.rl.job import Job, Session
+from jbrep.rl.files import FAILED, last_returns, read_evaluations
 from jbrep.rl.run import Run
-from jbrep.rl.trainers import train_jobs
+from jbrep.rl.training import Session, train
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within
 from jbrep.study.tables import references_of
 from jbrep.text import slug
@@ -102,56 +101,46 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
         raise InputError(
             f"{count} of the encoders would be called {name} as folders: give them other names"
         )
-    jobs = {
-        (label, seed): _job(task, names[label], encoder, seed, folder)
+    runs = {
+        folder / names[label] / f"seed-{seed}": _run(task, names[label], encoder, seed)
         for label, encoder in encoders.items()
         for seed in range(RUNS)
     }
-    returns = _returns([*jobs.values()], _trained([*jobs.values()]), task)
+    returns = _returns(runs, task)
     bounds = Bounds.of(task.return_floor, task.return_ceiling)
     found = {}
     for label in encoders:
-        own = [returns[jobs[label, seed].folder] for seed in range(RUNS)]
+        own = [returns[folder / names[label] / f"seed-{seed}"] for seed in range(RUNS)]
         found[label] = score(mean_within(np.concatenate(own), bounds, LEVEL))
     return found
 
 
-def _trained(jobs: Sequence[Job]) -> dict[Path, RunRecord]:
-    """What became of runs that learn together, by folder."""
-    done = {job.folder: 0 for job in jobs}  # a job is made anew where another's fails
-    with Progress(total=STEPS * len(jobs), unit="step", unit_scale=True, desc="agents") as bar:
-
-        def watch(job: Job, step: int) -> None:
-            bar.update(min(step, STEPS) - done[job.folder])
-            done[job.folder] = min(step, STEPS)
-
-        return {job.folder: record for job, record in train_jobs(jobs, Session(watch))}
-
-
-def _returns(
-    jobs: Sequence[Job], records: Mapping[Path, RunRecord], task: Task
-) -> dict[Path, Array]:
+def _returns(runs: Mapping[Path, Run], task: Task) -> dict[Path, Array]:
     """The last returns of each agent, (20,), by folder; see `learned` for those that failed."""
-    evaluations = {job.folder: read_evaluations(job.folder) for job in jobs}
+    session = Session(threads=cores())
+    records = {
+        folder: train(run, folder, session) for folder, run in Progress(runs.items(), desc="agents")
+    }
+    evaluations = {folder: read_evaluations(folder) for folder in runs}
     least = task.return_floor
     if least is None:
         seen = [each.episode_return for several in evaluations.values() for each in several]
         least = min(seen, default=None)
     found = {}
-    for job in jobs:
-        if (record := records[job.folder]).status != FAILED:
-            found[job.folder] = np.array(last_returns(evaluations[job.folder]))
+    for folder, record in records.items():
+        if record.status != FAILED:
+            found[folder] = np.array(last_returns(evaluations[folder]))
             continue
-        warnings.warn(f"{job.settings.name} failed: {record.reason}", Notice, stacklevel=2)
+        warnings.warn(f"{record.settings.name} failed: {record.reason}", Notice, stacklevel=2)
         if least is None:
-            raise InputError(f"{job.settings.name} has no return to count: {record.reason}")
-        found[job.folder] = np.full(EPISODES, least)
+            raise InputError(f"{record.settings.name} has no return to count: {record.reason}")
+        found[folder] = np.full(EPISODES, least)
     return found
 
 
-def _job(task: Task, name: str, encoder: Any, seed: int, folder: Path) -> Job:
+def _run(task: Task, name: str, encoder: Any, seed: int) -> Run:
     """A run on a code, by its name."""
-    run = Run.of(
+    return Run.of(
         task,
         _ALGORITHM,
         encoder=encoder,
@@ -161,4 +150,3 @@ def _job(task: Task, name: str, encoder: Any, seed: int, folder: Path) -> Job:
         evaluate_every=STEPS,
         final_episodes=EPISODES,
     )
-    return Job(run, folder / name / f"seed-{seed}", cores())

@@ -98,8 +98,6 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
             "unknown backend 'slurm': choose one of local, ray",
         ),
         (("README.md",), "README.md is not valid TOML"),
-        (("studies/paper.toml", "--width", 0), "'--width': 0 is not in the range"),
-        (("studies/paper.toml", "--width", 1000, "--workers", 9), "the width is 1000: 9 cohorts"),
     ):
         refused = jbrep("study", *arguments, "--out", tmp_path / "dry")
         assert (refused.exit_code, refused.output.count("\n")) == (2, 1), refused.output
@@ -205,10 +203,6 @@ MISTAKES = {
     "encoder info none": "no encoder at none",
     "encoder info dae-9 --task face_direction": "no encoder 'dae-9'",
     "rl --task face_direction --encoder x --out y": "no encoder 'x'",
-    "rl --task face_direction --out x --trainer both": "trainer is 'both': it must be",
-    "rl --task face_direction --out x --algorithm ppo --trainer cohort": "not ppo: add --trainer s",
-    "rl --task face_direction --out x --algorithm ppo --precision bfloat16": "sb3 has no bfloat16",
-    "rl --task face_direction --out x --precision half": "precision is 'half': it must be one of",
     "rl --task face_direction --out x --device tpu": "device is 'tpu': it must be one of",
     "report none": "none is not the folder of a study",
     "report": "Missing argument 'FOLDER'. See jbrep report --help.",

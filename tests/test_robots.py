@@ -148,21 +148,6 @@ def test_a_run_of_another_robot_is_not_resumed(own_module, tmp_path):
     assert "files.module robot42" in mistake(*data, "--steps", 80)
 
 
-def test_lanes_play_the_episode_before_again_when_they_go_on(monkeypatch):
-    """One that has just begun would not show another gear."""
-    lanes = Lanes(describe("Sledges/Sledge-v0"), 1)
-    for seed in (1, 2):
-        lanes.reset([0], [seed])
-        for _ in range(3 * (seed == 1)):
-            lanes.step(np.full((1, 3), 0.2))
-    state = lanes.state
-    lanes.restore(state)
-    step = import_module("environments").Sledge.step
-    monkeypatch.setattr("environments.Sledge.step", lambda self, action: step(self, action / 2))
-    with pytest.raises(InputError, match="not reproducible here, or another than it was"):
-        lanes.restore(state)
-
-
 # what 32 bits hold
 
 
@@ -229,7 +214,7 @@ def test_features_of_a_batch_have_no_offsets():
 def test_what_an_estimate_opens_is_closed(algorithm):
     task = describe("Pendulum-v1", max_episode_steps=20)
     run = Run.of(task, algorithm, steps=400, evaluation_episodes=1, overrides={"num_envs": 2})
-    assert estimate([run]) > 0
+    assert estimate(run) > 0
     assert not instances._used
 
 
@@ -241,9 +226,9 @@ def test_an_estimate_is_of_steps_and_evaluations(algorithm, monkeypatch):
     task = describe("Pendulum-v1", max_episode_steps=20)
     run = Run.of(task, algorithm, steps=4000, evaluate_every=500, final_episodes=15)
     evaluations = 8 + 3  # the last has three times as many episodes
-    learned = estimate([run]) - 5 * evaluations
+    learned = estimate(run) - 5 * evaluations
     per_step = learned / 4000
-    assert 0.5 * 5 / 310 < per_step <= 5 / 300
+    assert 5 / 700 < per_step <= 5 / 300
 
 
 # one robot, which fails
@@ -384,19 +369,6 @@ def test_evaluations_and_training_go_on_after_failures(tmp_path):
         True,
     )
     assert closed(tmp_path)
-
-
-def test_an_action_that_a_robot_changes_is_recorded_as_it_was(tmp_path):
-    """A stopped run's lanes go on; the data has what was handed out."""
-    lanes = Lanes(describe(arms.ID, {"log": str(tmp_path / "log")}), 1)
-    lanes.reset([0], [3])
-    for drive in (0.5, -0.25, 1.0):
-        given = np.array([[drive]])
-        lanes.step(given)
-        assert given == drive
-    np.testing.assert_array_equal(lanes.state["actions"][0, :, 0], [0.5, -0.25, 1.0])
-    lanes.restore(lanes.state)
-    lanes.close()
 
 
 # readings that are missing

@@ -31,9 +31,9 @@ from jbrep.rl.files import (
     read_evaluations,
     read_run,
 )
-from jbrep.rl.job import Scalars
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_file import read
+from jbrep.rl.training import Scalars
 
 TASK = describe("face_direction")
 SETTINGS = Run.of(

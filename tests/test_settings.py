@@ -289,8 +289,7 @@ def resumed(run, folder, stop_at=40):
 def test_a_stopped_run_resumes_to_the_same_bytes_whatever_its_settings(
     algorithm, overrides, tmp_path
 ):
-    trainer = "" if algorithm == "td3" else "sb3"
-    run = Run.of(**QUICK, algorithm=algorithm, overrides=overrides, trainer=trainer)
+    run = Run.of(**QUICK, algorithm=algorithm, overrides=overrides)
     train(run, tmp_path / "whole")
     resumed(run, tmp_path / "stopped")
     names = "episodes.csv", "evaluations.csv", POLICY

@@ -43,7 +43,7 @@ from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.stats.rules import Rules
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, as_study, read_study
-from jbrep.study.packing import forecast
+from jbrep.study.forecast import forecast
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.prepare import check, prepare
 from jbrep.study.record import runs_record
@@ -217,7 +217,7 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
     assert few[1].startswith("sac-wide learns from step 25,600 on: ")
     assert TINY.replace(data={"": Data(steps=1000)}).notices == TINY.notices[:1]
     path = written(tmp_path, f"representations = {json.dumps(representations)}")
-    monkeypatch.setattr("jbrep.study.packing.estimate", lambda run: 60)
+    monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
     assert "This study compares nothing: it has one" in told.stderr
     assert max(map(len, told.stderr.splitlines())) <= 80
@@ -444,15 +444,6 @@ def tables_with(plan, folder, runs, **settings):
         forge(path, {**run, "settings": {**run["settings"], **settings}})
     write_tables(folder)
     return read_tables(folder)
-
-
-def test_runs_of_different_trainers_are_compared_on_request(done, tmp_path):
-    results = tables_with(done, tmp_path, "pca-8/*", trainer="cohort")
-    assert results.analysis is None
-    trainers = "trainers: cohort float32 cpu, sb3 float32 cpu; report those of one"
-    assert trainers in results.left_out[0]
-    assert read_tables(tmp_path, across_trainers=True).analysis
-    assert jbrep("report", tmp_path, "--across-trainers", "--json").exit_code == 0
 
 
 @pytest.mark.usefixtures("one_figure")

@@ -35,7 +35,7 @@ from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.policy import load_run
 from jbrep.study.config import Data, as_study
-from jbrep.study.packing import forecast
+from jbrep.study.forecast import forecast
 from jbrep.study.plan import Plan, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.record import EACH_ITS_OWN, RECORD
@@ -453,7 +453,7 @@ def test_a_drawing_of_an_encoder_without_decoder_ends_with_the_latent():
 
 def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "jbrep.study.packing.estimate", lambda runs: 60 if runs[0].encoder == NET else 30
+        "jbrep.study.forecast.estimate", lambda run: 60 if run.encoder == NET else 30
     )
     runs = forecast(Plan(done.study, tmp_path / "it"), 1).runs
     assert [seconds for _, _, seconds in runs[:5]] == [30, 30, 60, 30, 30]

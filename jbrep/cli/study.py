@@ -26,11 +26,6 @@ _COUNT = click.IntRange(1, 1024)
     help="Processes at a time.  [default: one for each core; one if it learns on a GPU]",
 )
 @click.option(
-    "--width",
-    type=_COUNT,
-    help="The most agents that learn together in a process.  [default: what keeps all busy]",
-)
-@click.option(
     "--backend",
     default="local",
     show_default=True,
@@ -51,7 +46,6 @@ def study(
     study: Path,
     out: Path | None,
     workers: int | None,
-    width: int | None,
     backend: str,
     dry_run: bool,
     register: bool,
@@ -69,8 +63,8 @@ def study(
 
     if dry_run and register:
         raise InputError("--dry-run and --register exclude each other: choose one")
-    if register and (workers or width or backend != "local"):
-        raise InputError("--register runs nothing: leave out --workers, --width and --backend")
+    if register and (workers or backend != "local"):
+        raise InputError("--register runs nothing: leave out --workers and --backend")
     if not exists(study):
         raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)
@@ -81,27 +75,25 @@ def study(
         raise InputError("--dry-run forecasts this machine alone: leave out --backend")
     folder = out or Path("runs") / study.stem
     if dry_run or register:
-        _announce(study, folder, dry_run, workers, width)
+        _announce(study, folder, dry_run, workers)
         return
     from jbrep import api
 
     with stoppable(RESUMES):
-        made = api.study(study, folder, workers=workers, width=width, backend=backend)
+        made = api.study(study, folder, workers=workers, backend=backend)
     _show(made)
     context.exit(bool(made.tables.record.missing))
 
 
-def _announce(
-    path: Path, folder: Path, dry_run: bool, workers: int | None, width: int | None
-) -> None:
+def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> None:
     """Say what a study is going to do, or write it down before the first run."""
     from jbrep.report.statistics import forecast_text
     from jbrep.study import Plan, read_study, register_study
-    from jbrep.study.packing import forecast
+    from jbrep.study.forecast import forecast
     from jbrep.study.registration import registration_in
 
     plan = Plan(read_study(path), folder, path)
-    expected = forecast(plan, workers, width) if dry_run else None
+    expected = forecast(plan, workers) if dry_run else None
     for notice in plan.study.notices:
         tell(notice, err=True)
     if expected:
@@ -123,9 +115,6 @@ def _announce(
     help="From jbrep evaluate, of encoders of these runs: its diagnostics go into the tables. "
     "{task} in it stands for each task. May be repeated.",
 )
-@click.option(
-    "--across-trainers", is_flag=True, help="Compare runs of different trainers or precisions, too."
-)
 @click.option("--out", type=PATH, help="A folder for it.  [default: the study's own]")
 @click.option("--all", "everything", is_flag=True, help="Print every table; the page has them.")
 @import_option
@@ -133,7 +122,6 @@ def _announce(
 def report(
     folder: Path,
     evaluation: tuple[str, ...],
-    across_trainers: bool,
     out: Path | None,
     everything: bool,
     as_json: bool,
@@ -145,7 +133,7 @@ def report(
     """
     from jbrep import api
 
-    made = api.report(folder, evaluation=evaluation, across_trainers=across_trainers, out=out)
+    made = api.report(folder, evaluation=evaluation, out=out)
     _show(made, everything, as_json)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jbrep.envs.domain import Domain, Drawn, Draws
 from jbrep.envs.physics import FRICTIONS, MASSES, physics_of, put_factors, velocity_after
-from jbrep.envs.task import Array, Task, not_the_same
+from jbrep.envs.task import Array, Task
 
 _OPTIONS = ("friction", "mass", "body")  # of a batch that has them, when it is reset
 
@@ -93,28 +93,6 @@ class Disturbed:
     def _late(self, values: Array, name: str) -> Array:
         """Those of so many steps before, (n, ...), as the episode has drawn."""
         return values[np.arange(len(values)), self._drawn[name].astype(np.int64)]
-
-    @property
-    def state(self) -> dict[str, Any]:
-        own = {
-            "domain_given": self._given,
-            "domain_measured": self._measured,
-            "domain_commands": self._commands,
-            "domain_shown": self._shown,
-        }
-        copies = {name: values.copy() for name, values in own.items()}
-        return copies | self._draws.state | self._batch.state
-
-    def restore(self, state: Mapping[str, Any]) -> tuple[Array, Any]:
-        own = {name: each for name, each in state.items() if name.startswith("domain_")}
-        given, info = self._batch.restore({n: v for n, v in state.items() if n not in own})
-        if given.tobytes() != own["domain_given"].tobytes():
-            raise not_the_same(self._task)
-        self._given, self._shown = given, own["domain_shown"].copy()
-        self._measured[:], self._commands[:] = own["domain_measured"], own["domain_commands"]
-        self._draws.restore(own)
-        self._draw(np.arange(len(given)), own["domain_seeds"])
-        return self._shown.copy(), info
 
 
 def _put_first(values: Array, newest: Array) -> None:

@@ -181,12 +181,3 @@ class Draws:
 
     def _now(self, block: Array) -> Array:
         return block[np.arange(len(block)), self._steps % _BLOCK]
-
-    @property
-    def state(self) -> dict[str, NDArray[np.int64]]:
-        return {"domain_seeds": self._seeds.copy(), "domain_steps": self._steps.copy()}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Be where the state was taken."""
-        self._seeds[:], self._steps[:] = state["domain_seeds"], state["domain_steps"]
-        self._fill(np.arange(len(self._seeds)))

@@ -66,10 +66,11 @@ def _making(env_id: str, arguments: Mapping[str, Any]) -> Iterator[None]:
 def is_batched(task: Task) -> bool:
     """Whether the environment steps many lanes faster together than one by one.
 
-    That is so if the registered vector entry point is a class with `state` and `restore`, and with
-    the arguments num_threads, dtype and autoreset_mode.
+    That is so if the registered vector entry point is a class that says so: one with a true
+    attribute `resets_lanes`, the arguments num_threads, dtype and autoreset_mode, and a `reset`
+    that takes the option `reset_mask`.
     """
-    return hasattr(creator(spec_of(task), vector=True), "restore")
+    return getattr(creator(spec_of(task), vector=True), "resets_lanes", False)
 
 
 def is_one_robot(task: Task, threads: int | None) -> bool:

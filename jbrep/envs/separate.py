@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from jbrep.envs import instances
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
 from jbrep.envs.make import action_in, aside, flattener, number, of_size
-from jbrep.envs.task import Array, Task, most_held, not_the_same
+from jbrep.envs.task import Array, Task, most_held
 from jbrep.errors import InputError, Notice, kind_and_line
 
 Flags = NDArray[np.bool_]
 State = dict[str, NDArray[Any]]
 _LARGEST = float(np.finfo(np.float32).max)  # that data sets and agents can have
-_NOW, _BEFORE = "", "before_"  # begin the names of what a state has of each lane's episodes
 
 
 class EnvironmentFailedError(InputError):
@@ -62,13 +61,6 @@ class _MissingError(Exception):
     """A reading is missing, before which the episode is to end."""
 
 
-class _Episode(NamedTuple):
-    """A lane's episode so far: it follows from the seed and the actions."""
-
-    seed: int | None
-    actions: list[NDArray[np.float32]]
-
-
 class Separate:
     """An environment for each lane.
 
@@ -105,9 +97,8 @@ class Separate:
         self._infos: list[Mapping[str, Any]] = [{} for _ in range(num_lanes)]
         self._succeeded = np.zeros(num_lanes, np.bool_)  # at any step of the episode so far
         self._active = np.zeros(num_lanes, np.bool_)
-        self._episodes = [_Episode(0, []) for _ in range(num_lanes)]
-        self._before = [_Episode(0, []) for _ in range(num_lanes)]
-        self._last = np.zeros((num_lanes, task.size))  # observations of the episodes before
+        self._seeds: list[int | None] = [0] * num_lanes
+        self._steps = np.zeros(num_lanes, np.int64)  # of each episode, with the one under way
         self._last_reward = np.zeros(num_lanes)  # of the episode under way
         self._held = np.zeros(num_lanes, np.int64)  # steps in a row with missing readings
         self.missing = np.zeros(num_lanes, np.int64)
@@ -123,15 +114,12 @@ class Separate:
     ) -> tuple[Array, dict[str, Array]]:
         self._make_new_arrays()
         for lane in np.flatnonzero(options["reset_mask"]).tolist():
-            if self._episodes[lane].actions:
-                self._before[lane] = self._episodes[lane]
-                self._last[lane] = self._observation[lane]
             self._begin(lane, seed[lane])
         return self._observation, self._arrays
 
     def _begin(self, lane: int, seed: int | None) -> None:
         """Begin an episode, if need be with another instance."""
-        self._episodes[lane], self._active[lane] = _Episode(seed, []), True
+        self._seeds[lane], self._steps[lane], self._active[lane] = seed, 0, True
         while True:
             self._held[lane] = self.missing[lane] = self._last_reward[lane] = 0
             self.failed[lane] = False
@@ -144,19 +132,14 @@ class Separate:
                 self._handle_failure(lane, error)
 
     def step(self, actions: Array) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
-        return self._advance(actions, self._active)
-
-    def _advance(
-        self, actions: Array, chosen: Flags
-    ) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
-        """Step the lanes that are chosen."""
+        chosen = self._active.copy()
         self._make_new_arrays()
         self._reward, self.lost = np.zeros(len(chosen)), np.zeros(len(chosen), np.bool_)
         single = actions.astype(np.float32)
         terminated, truncated = np.zeros((2, len(chosen)), np.bool_)
         with aside():
             for lane in np.flatnonzero(chosen).tolist():
-                self._episodes[lane].actions.append(single[lane])
+                self._steps[lane] += 1
                 try:
                     terminated[lane], truncated[lane] = self._step(lane, single[lane])
                 except _MissingError:
@@ -218,14 +201,14 @@ class Separate:
             return flat, reward  # their sum is larger
         self.missing[lane] += missing.sum() + is_missing
         self._held[lane] += 1
-        if self._task.missing == "skip" and len(self._episodes[lane].actions) > 1:
+        if self._task.missing == "skip" and self._steps[lane] > 1:
             raise _MissingError
         if not after_step or self._held[lane] > most_held(self._task.missing or ""):
             raise EnvironmentFailedError(
                 f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
                 "reward that is not finite in 32 bits, at step "
-                f"{len(self._episodes[lane].actions)} of the episode with seed "
-                f"{self._episodes[lane].seed}; {self._missing_said}",
+                f"{self._steps[lane]} of the episode with seed "
+                f"{self._seeds[lane]}; {self._missing_said}",
                 lane,
             )
         filled = np.where(missing, self._observation[lane], flat)
@@ -241,7 +224,7 @@ class Separate:
     def _lose(self, lane: int) -> None:
         """Let the episode of a lane end before the step that it just took."""
         self.lost[lane], self._reward[lane] = True, 0.0
-        self._episodes[lane].actions.pop()
+        self._steps[lane] -= 1
 
     def _handle_failure(self, lane: int, error: Exception) -> None:
         """Go on after a failure, with a new instance at the next reset.
@@ -254,8 +237,8 @@ class Separate:
             self.envs[lane] = None
         if not isinstance(error, EnvironmentFailedError):
             error = EnvironmentFailedError(
-                f"{self._task.name} failed at step {len(self._episodes[lane].actions)} of the "
-                f"episode with seed {self._episodes[lane].seed}: {kind_and_line(error)}",
+                f"{self._task.name} failed at step {self._steps[lane]} of the "
+                f"episode with seed {self._seeds[lane]}: {kind_and_line(error)}",
                 lane,
             )
         self._retries[lane].failed(error)
@@ -272,44 +255,6 @@ class Separate:
         """
         told = zip(self._infos, self._succeeded.tolist(), strict=True)
         return [numbers_in(info) | ({SUCCESS: 1.0} if won else {}) for info, won in told]
-
-    @property
-    def state(self) -> State:
-        """What `restore` takes: the actions of each lane's episode, and of the one before."""
-        now, before = self._played(_NOW, self._episodes), self._played(_BEFORE, self._before)
-        return {**now, **before, f"{_BEFORE}observation": self._last.copy()}
-
-    def _played(self, prefix: str, episodes: Sequence[_Episode]) -> State:
-        lengths = [len(each.actions) for each in episodes]
-        taken = np.zeros((len(episodes), max(lengths), self._task.action_size), np.float32)
-        for lane, each in enumerate(episodes):
-            taken[lane, : len(each.actions)] = each.actions or 0
-        return {
-            f"{prefix}episode_seeds": np.array([each.seed for each in episodes]),
-            f"{prefix}lengths": np.array(lengths),
-            f"{prefix}actions": taken,
-        }
-
-    def restore(self, state: State) -> tuple[Array, dict[str, Array]]:
-        """Play the episodes again; the ones before tell whether these are still the same robots."""
-        played = state[f"{_BEFORE}lengths"] > 0
-        if played.any():
-            self._play(_BEFORE, state)
-            last = state[f"{_BEFORE}observation"]
-            if self._observation[played].tobytes() != last[played].tobytes():
-                raise not_the_same(self._task)
-        self._play(_NOW, state)
-        self._last = state[f"{_BEFORE}observation"].copy()
-        for lane in np.flatnonzero(~played).tolist():
-            self._before[lane] = _Episode(0, [])
-        return self._observation, self._arrays
-
-    def _play(self, prefix: str, state: State) -> None:
-        lengths, every_lane = state[f"{prefix}lengths"], np.ones(len(self.envs), np.bool_)
-        seeds = state[f"{prefix}episode_seeds"].tolist()
-        self.reset(seeds, {"reset_mask": every_lane})
-        for step in range(max(lengths.tolist())):
-            self._advance(state[f"{prefix}actions"][:, step], step < lengths)
 
     def close(self) -> None:
         """Give the environments back."""

@@ -421,11 +421,3 @@ def check_same(expected: Task, actual: Task, what: str) -> None:
             f"{what} was made for features of {actual.name} with other offsets: give those in "
             "--features"
         )
-
-
-def not_the_same(task: Task) -> InputError:
-    """The error where the same seed and actions lead elsewhere."""
-    return InputError(
-        f"{task.name} is not reproducible here, or another than it was: the same seed and actions "
-        "lead to another state, so this can't continue where it stopped"
-    )

@@ -75,7 +75,6 @@ def make_report(
     folder: Path,
     out: Path | None = None,
     evaluations: Sequence[str] = (),
-    across_trainers: bool = False,
 ) -> Report:
     """Write the tables of the runs below a folder, if there are any, and the report of the tables.
 
@@ -85,7 +84,6 @@ def make_report(
         folder: with runs, of a study or not, or with the tables of a study alone.
         out: folder for the report; the same one if not given.
         evaluations: as for `jbrep.study.tables.add_diagnostics`.
-        across_trainers: compare runs of different trainers, too.
     """
     out, ran = out or folder, has_runs(folder)
     if not ran:
@@ -98,7 +96,7 @@ def make_report(
         if ran:
             write_tables(folder)
         notes = add_diagnostics(folder, evaluations)
-        tables = read_tables(folder, across_trainers)
+        tables = read_tables(folder)
         notes += _without_references(tables)
         return Report(out, tables, notes, write_report(tables, out))
 

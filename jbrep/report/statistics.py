@@ -1,10 +1,8 @@
 """Statistics as tables."""
 
 import math
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from operator import attrgetter
-from typing import Any
 
 from jbrep.report import facts
 from jbrep.report.answer import answer
@@ -29,8 +27,7 @@ from jbrep.stats.labels import RepresentationResult
 from jbrep.stats.power import Prospect
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import SOLVED
-from jbrep.study.costs import Cost
-from jbrep.study.packing import Forecast
+from jbrep.study.forecast import Cost, Forecast
 from jbrep.study.plan import Cell
 from jbrep.study.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, duration, number, percentiles, rounded, table, wrapped
@@ -236,7 +233,8 @@ def forecast_text(forecast: Forecast, planned: Planned, width: int | None = None
     """The runs to go, how long they would take, and what could be found of its claims."""
     summary = (
         f"{len(forecast.runs)} runs to go, {forecast.done} done; "
-        f"{duration(forecast.seconds)} on one core, {duration(forecast.elapsed)} with "
+        f"{duration(sum(time for _, time in forecast.runs))} on one core, "
+        f"{duration(forecast.elapsed)} with "
         f"{forecast.workers} workers, besides data and encoders"
     )
     parts = [_to_go(forecast.runs).text(width)] if forecast.runs else []
@@ -260,31 +258,17 @@ def _made_first(costs: Sequence[Cost]) -> Table:
     return Table.of("", costs, columns)
 
 
-def _to_go(runs: Sequence[tuple[Cell, int, float]]) -> Table:
-    """A row for the runs of each label: how many learn at once, and how long these take."""
-    sizes = Counter(cohort for _, cohort, _ in runs)
-    of_labels: dict[str, list[tuple[int, float]]] = {}
-    for cell, cohort, time in runs:
-        of_labels.setdefault(cell.label, []).append((sizes[cohort], time))
-
-    def spread(show: Callable[[Any], str], values: Iterable[Any]) -> str:
-        shown = dict.fromkeys(map(show, sorted(values)))
-        first, last = next(iter(shown)), next(reversed(shown))
-        return first if first == last else f"{first} to {last}"
-
-    return Table(
-        "",
-        ("agents", "runs", "at once", "time"),
-        [
-            (
-                label,
-                str(len(each)),
-                spread(str, (size for size, _ in each)),
-                spread(duration, (time for _, time in each)),
-            )
-            for label, each in of_labels.items()
-        ],
-    )
+def _to_go(runs: Sequence[tuple[Cell, float]]) -> Table:
+    """A row for the runs of each label, and how long each takes."""
+    of_labels: dict[str, list[float]] = {}
+    for cell, time in runs:
+        of_labels.setdefault(cell.label, []).append(time)
+    columns = {
+        "agents": lambda each: each[0],
+        "runs": lambda each: str(len(each[1])),
+        "time of each": lambda each: duration(max(each[1])),
+    }
+    return Table.of("", of_labels.items(), columns)
 
 
 def prospects_table(prospects: Sequence[Prospect]) -> Table:

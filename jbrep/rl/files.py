@@ -55,7 +55,7 @@ class RunRecord(Document, frozen=True, kw_only=True):
     """run.json: a run that has ended."""
 
     format = "jbrep run"
-    format_version = 6
+    format_version = 7
 
     status: Literal["finished", "failed"]
     reason: Line | None  # why it failed
@@ -88,7 +88,7 @@ class PolicyHeader(Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep policy"
-    format_version = 4
+    format_version = 5
 
     settings: RunSettings
     encoder: dict[str, Any] | None

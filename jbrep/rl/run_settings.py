@@ -38,7 +38,6 @@ class SharedSettings(TrainingSettings, frozen=True, kw_only=True):
     encoder_code: Line | None  # module:Class, if it is code that no file can hold
     evaluate_every: Steps
     final_episodes: Episodes
-    trainer: Literal["cohort", "sb3"]
     device: Literal["cpu", "cuda"]
 
     def check(self) -> None:

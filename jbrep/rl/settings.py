@@ -18,8 +18,6 @@ CLASSES = {  # by the names of algorithms
     "crossq": "sb3_contrib.CrossQ",
 }
 CPU, CUDA = "cpu", "cuda"
-COHORT, SB3 = "cohort", "sb3"
-PRECISIONS = FLOAT32, BFLOAT16 = "float32", "bfloat16"
 PAPER, MODERN, WIDE = "paper", "modern", "wide"  # presets; a name without one has the paper's
 MAX_STEPS = 10**12  # of training
 MAX_EPISODES = 10_000  # of an evaluation
@@ -72,23 +70,9 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
             extra={"default": "ten times as many"},
         ),
     ] = 0
-    trainer: Annotated[
-        Literal["", "cohort", "sb3"],
-        Meta(
-            description="cohort, which is jbrep's own, or sb3, stable-baselines3 itself.",
-            extra={"default": "cohort for ddpg, td3 and sac, sb3 for the others"},
-        ),
-    ] = ""
-    precision: Annotated[
-        Literal["float32", "bfloat16"],
-        Meta(
-            description="Of a cohort's matrix multiplications: float32, or bfloat16, which some "
-            "processors compute several times as fast."
-        ),
-    ] = "float32"
     device: Annotated[
         Literal["cpu", "cuda", "auto"],
-        Meta(description="Where a cohort takes gradient steps; auto is cuda where there is one."),
+        Meta(description="Of gradient steps; auto is cuda where there is one."),
     ] = "cpu"
 
     def check(self) -> None:

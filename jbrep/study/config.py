@@ -25,7 +25,6 @@ from jbrep.records.storage import exists
 from jbrep.records.toml import read_toml, toml_text
 from jbrep.rl.learner import Learner
 from jbrep.rl.presets import learns_from
-from jbrep.rl.run import trainer_of
 from jbrep.rl.settings import MAX_STEPS, Seed, TrainingSettings
 from jbrep.stats.claims import NOT_WORSE
 from jbrep.stats.pairs import FEWEST_UNITS, linked_units
@@ -104,7 +103,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep study"
-    format_version = 3
+    format_version = 4
 
     tasks: Annotated[
         tuple[str, ...],
@@ -179,8 +178,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         self._check_tasks()
         Domain(**read_ranges(self.domain or {}))
         for algorithm in self.algorithms:
-            for each in self.learner(algorithm).variants:
-                trainer_of(each, self)
+            self.learner(algorithm)
         self._check_data()
         self._check_verdicts()
 

@@ -1,16 +1,14 @@
 """A study's folder: where its files are, and which runs it has."""
 
-import json
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.envs.description import describe
-from jbrep.envs.instances import memory_of_each
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
 from jbrep.records.commit import in_work_tree
@@ -52,11 +50,6 @@ class Cell:
     def label(self) -> str:
         """What it shares with the runs of other seeds: TASK/ALGORITHM/REPRESENTATION."""
         return f"{self.task}/{self.learner.name}/{self.representation.name}"
-
-    @property
-    def kind(self) -> tuple[str, str]:
-        """What it shares with the runs that it can learn together with: task and settings."""
-        return self.task, json.dumps([self.learner.name, self.learner.table], sort_keys=True)
 
     @property
     def name(self) -> str:
@@ -119,11 +112,6 @@ class Plan:
         study = self.study
         return describe(name, study.environment, study.episode_steps, domain=study.domain or {})
 
-    @cached_property
-    def robot_memory(self) -> Callable[[str], int]:
-        """Bytes that each environment of a task takes, by the task's name; measured once."""
-        return cache(lambda name: memory_of_each(self.task(name)))
-
     def run(self, cell: Cell) -> Run:
         """What to train."""
         made = self.encoders(cell.task) if self.study.data else None
@@ -182,9 +170,9 @@ class Plan:
             *self.registration.other_data(self.policies, self.existing_data),
         ]
 
-    def assigned(self, cells: Iterable[Cell]) -> list[Assigned]:
-        """Runs for a worker."""
-        return [Assigned(cell.name, self.run(cell), self.folder_of(cell)) for cell in cells]
+    def assigned(self, cell: Cell) -> Assigned:
+        """A run for a worker."""
+        return Assigned(cell.name, self.run(cell), self.folder_of(cell))
 
     def encoders(self, task: str) -> Path:
         """The folder of the encoders that the study trains for a task."""

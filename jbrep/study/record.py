@@ -111,7 +111,7 @@ class RunsRecord(Document, frozen=True, kw_only=True):
     """runs.json."""
 
     format = "jbrep runs"
-    format_version = 4
+    format_version = 5
     indent = 1
 
     study: Study | None  # None for runs without one

@@ -14,7 +14,7 @@ from jbrep.records.document import Document, document_from, parse_json
 from jbrep.records.record import Version, from_plain, to_plain
 from jbrep.records.storage import exists, read_file
 from jbrep.rl.files import RunRecord
-from jbrep.rl.job import packages
+from jbrep.rl.training import packages
 from jbrep.study.config import Study
 
 REGISTRATION = "registration.json"
@@ -25,7 +25,7 @@ class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
     """registration.json, beside a study's file and in its folder."""
 
     format = "jbrep registration"
-    format_version = 2
+    format_version = 3
 
     study: dict[str, Any]  # as it was written
     encoders: dict[str, str]  # SHA-256 of those that are there beforehand, by the name of the run
