@@ -128,7 +128,7 @@ def test_an_agent_whose_environment_fails_ends_alone(data, tmp_path, monkeypatch
 
     def fail_once(self, seeds):
         if next(numbers) == 0:
-            raise EnvironmentFailedError("no power", 0)
+            raise EnvironmentFailedError("no power")
         return reset(self, seeds)
 
     monkeypatch.setattr(AutoresetLanes, "reset", fail_once)

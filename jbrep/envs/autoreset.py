@@ -46,7 +46,7 @@ class AutoresetLanes:
     Args:
         task: whose environment is made.
         num_lanes: n.
-        num_threads: as for `Lanes`.
+        num_threads: threads to step a batch on.
         repeat: steps for which each action is held; fewer where an episode ends before.
         retries: of failures, each of which ends an episode, truncated, before the step that failed.
 

@@ -224,6 +224,5 @@ class Lanes:
         lane = int(np.flatnonzero(~good)[0])
         raise EnvironmentFailedError(
             f"{self.task.name} {did} an observation or reward that is not finite, at step "
-            f"{self._steps[lane]} of the episode with seed {self._seeds[lane]}",
-            lane,
+            f"{self._steps[lane]} of the episode with seed {self._seeds[lane]}"
         )

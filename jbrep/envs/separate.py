@@ -20,33 +20,17 @@ _LARGEST = float(np.finfo(np.float32).max)  # that data sets and agents can have
 
 
 class EnvironmentFailedError(InputError):
-    """An environment raised an error, or gave something else than its task's description says.
-
-    Attributes:
-        lane: in which it did.
-    """
-
-    def __init__(self, message: str, lane: int):
-        super().__init__(message)
-        self.lane = lane
+    """An environment raised an error, or gave something else than its task's description says."""
 
 
 class Retries:
-    """How often what fails is tried again, in a row.
-
-    Args:
-        most: times.
-    """
+    """How often what fails is tried again, in a row."""
 
     def __init__(self, most: int = 0):
         self._most = self._left = most
 
     def failed(self, error: Exception) -> None:
-        """Tell of a failure.
-
-        Raises:
-            Exception: the error itself, if there were as many before.
-        """
+        """Tell of a failure, or raise it if there were as many before."""
         if not self._left:
             raise error
         self._left -= 1
@@ -206,10 +190,7 @@ class Separate:
         if not after_step or self._held[lane] > most_held(self._task.missing or ""):
             raise EnvironmentFailedError(
                 f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
-                "reward that is not finite in 32 bits, at step "
-                f"{self._steps[lane]} of the episode with seed "
-                f"{self._seeds[lane]}; {self._missing_said}",
-                lane,
+                f"reward that is not finite in 32 bits, {self._where(lane)}; {self._missing_said}"
             )
         filled = np.where(missing, self._observation[lane], flat)
         return filled, self._last_reward[lane] if is_missing else reward
@@ -221,25 +202,22 @@ class Separate:
             return "no episode can end before its first step: give --missing hold:1, or more"
         return f"that is beyond --missing {missing}" if missing else "--missing says what to do"
 
+    def _where(self, lane: int) -> str:
+        return f"at step {self._steps[lane]} of the episode with seed {self._seeds[lane]}"
+
     def _lose(self, lane: int) -> None:
         """Let the episode of a lane end before the step that it just took."""
         self.lost[lane], self._reward[lane] = True, 0.0
         self._steps[lane] -= 1
 
     def _handle_failure(self, lane: int, error: Exception) -> None:
-        """Go on after a failure, with a new instance at the next reset.
-
-        Raises:
-            EnvironmentFailedError: there were too many.
-        """
+        """Go on after a failure, unless there were too many, with a new instance."""
         if self.envs[lane] is not None:
             instances.discard(self.envs[lane])
             self.envs[lane] = None
         if not isinstance(error, EnvironmentFailedError):
             error = EnvironmentFailedError(
-                f"{self._task.name} failed at step {self._steps[lane]} of the "
-                f"episode with seed {self._seeds[lane]}: {kind_and_line(error)}",
-                lane,
+                f"{self._task.name} failed {self._where(lane)}: {kind_and_line(error)}"
             )
         self._retries[lane].failed(error)
 
