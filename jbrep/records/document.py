@@ -62,7 +62,7 @@ def document_from(given: Mapping[str, Any], path: Path, kind: type[_Document]) -
     try:
         return from_plain(fields, kind)
     except InputError as error:
-        raise DamageError(f"{path} is damaged, or not a {kind.format} file: {error}") from None
+        raise DamageError(f"{path} is damaged or not a {kind.format} file: {error}") from None
 
 
 def parse_json(raw: bytes, path: Path, what: str) -> dict[str, Any]:
