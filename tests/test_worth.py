@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.command import jbrep, mistake
 from helpers.small import brief
+from jbrep.rl.trainers import train_jobs
 
 from jbrep import worth
 from jbrep.collect import collect
@@ -24,7 +25,6 @@ from jbrep.records.lock import exclusive
 from jbrep.report.evaluation import evaluation_text
 from jbrep.report.worth import condition, conditioning
 from jbrep.rl.files import read_evaluations
-from jbrep.rl.trainers import train_jobs
 from jbrep.worth import add_worth, learned
 
 
