@@ -15,7 +15,6 @@ from rich.table import Table
 from jbrep.envs.names import imported_modules
 from jbrep.machine import cores
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
-from jbrep.records.document import read_document
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, make_folder
 from jbrep.rl.files import FAILED, FINISHED, read_run
@@ -28,6 +27,7 @@ from jbrep.study.registration import (
     Registration,
     beside,
     find_committed,
+    registration_in,
 )
 from jbrep.study.tables import REFERENCE_RETURNS
 from jbrep.study.work import CRASHED, Outcome, read_progress, say, work
@@ -171,7 +171,7 @@ def register_study(plan: Plan) -> Path:
                 _register(plan)
         return plan.folder / REGISTRATION
     path = beside(plan.file)
-    if not exists(path) or read_document(path, Registration).registered != plan.study:
+    if not exists(path) or registration_in(path).registered != plan.study:
         plan.check_new()
         _registration(plan).write(path)
     return path
