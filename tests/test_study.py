@@ -431,7 +431,7 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
 
 def test_each_run_says_which_module_is_not_here(tmp_path):
     plan = Plan(TINY.replace(representations=("full",)), tmp_path)
-    ended = work(plan.assigned(plan.cells), modules=["robots_elsewhere"])
+    ended = [work(plan.assigned(cell), modules=["robots_elsewhere"]) for cell in plan.cells]
     assert [each.status for each in ended] == ["crashed"] * 2
     assert all("can't import robots_elsewhere" in each.message for each in ended)
 
@@ -454,7 +454,7 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     finished, begun, *_ = plan.cells
     shutil.copytree(done.folder_of(finished), plan.folder_of(finished))
     stop = iter((False, True)).__next__  # after its first rollout
-    assert work(plan.assigned([begun]), stop) is None
+    assert work(plan.assigned(begun), stop) is None
     assert (plan.folder_of(begun) / CHECKPOINT).exists()
     reported = jbrep("report", out, "--json")
     assert reported.exit_code == 0, reported.output

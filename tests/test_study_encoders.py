@@ -437,10 +437,10 @@ def test_a_worker_imports_the_modules_it_is_told_to(done, tmp_path, monkeypatch)
     monkeypatch.setattr("jbrep.envs.names._imported", [])
     run = done.run(done.cells[2])
     assert run.encoder == NET
-    assigned = [Assigned("net", run, tmp_path)]
-    (crashed,) = work(assigned)
+    assigned = Assigned("net", run, tmp_path)
+    crashed = work(assigned)
     assert "add --import my_encoders" in crashed.message
-    (ended,) = work(assigned, modules=["my_encoders"])
+    ended = work(assigned, modules=["my_encoders"])
     assert ended.status == "finished"
 
 
@@ -456,7 +456,7 @@ def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):
         "jbrep.study.forecast.estimate", lambda run: 60 if run.encoder == NET else 30
     )
     runs = forecast(Plan(done.study, tmp_path / "it"), 1).runs
-    assert [seconds for _, _, seconds in runs[:5]] == [30, 30, 60, 30, 30]
+    assert [seconds for _, seconds in runs[:5]] == [30, 30, 60, 30, 30]
 
 
 def test_a_run_on_code(done, tmp_path, monkeypatch):
@@ -484,7 +484,7 @@ def test_a_run_on_an_object_resumes_with_the_same_object_alone(tmp_path):
     run = Run.of(encoder=FirstFeatures(), **SHARED)
     with pytest.raises(StoppedError):
         train(run, tmp_path, Session(stop=lambda: next(asked)))
-    with pytest.raises(InputError, match="belongs to another configuration: encoder"):
+    with pytest.raises(InputError, match="holds another run: encoder"):
         train(Run.of(encoder=FirstFeatures(-1), **SHARED), tmp_path)
     result = train(run, tmp_path)
     assert result.settings.representation == "FirstFeatures"
