@@ -249,7 +249,7 @@ def evaluate(
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
     from jbrep.evaluate.evaluation import EVALUATION
-    from jbrep.records.storage import check_writable
+    from jbrep.records.storage import make_folder
 
     if agents and out is None:
         raise InputError("agents' runs are kept: give out, a folder")
@@ -264,7 +264,7 @@ def evaluate(
 
         hidden_of(scaled.dataset, whole)
     if out is not None:
-        check_writable(Path(out), (EVALUATION,))
+        make_folder(Path(out), (EVALUATION,))
     from jbrep.evaluate.diagnosis import diagnose, write  # imports torch
     from jbrep.play.sources import find_good_policy
 
@@ -397,12 +397,12 @@ def report(
         evaluation: folders of evaluations of its encoders, whose diagnostics go into the tables.
         out: a folder for the report; None for the study's own.
     """
-    from jbrep.records.storage import check_writable, exists
+    from jbrep.records.storage import exists, make_folder
 
     if not exists(folder):
         raise InputError(f"{folder} is not the folder of a study: there is no such folder")
     if out:
-        check_writable(Path(out))
+        make_folder(Path(out))
     from jbrep.report.report import make_report  # imports torch
 
     return make_report(Path(folder), Path(out) if out else None, evaluation)

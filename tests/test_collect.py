@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from io import BytesIO
 from pathlib import Path
 
 import gymnasium
@@ -318,21 +317,6 @@ def test_a_disk_that_is_really_full(collected, tmp_path):
         assert contents(disk / "data") == contents(collected)
     finally:
         subprocess.run(["umount", str(disk)], check=True)
-
-
-def test_a_write_that_reads_back_otherwise_is_refused(collected, tmp_path, monkeypatch):
-    opened = Path.open
-
-    def damaged(path, mode="r", *arguments, **more):
-        if mode == "rb" and "partial" in path.name:
-            return BytesIO(bytes(path.stat().st_size))
-        return opened(path, mode, *arguments, **more)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "open", damaged)
-        with pytest.raises(InputError, match=r"can't write .*it reads back otherwise"):
-            write_again(collected, tmp_path / "data")
-    assert [path.name for path in (tmp_path / "data").iterdir()] == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -122,13 +122,13 @@ def test_a_lane_that_has_ended_stands_still():
         np.testing.assert_array_equal(each.step.observation[before], last[before])
         assert not each.step.reward[before].any()
         np.testing.assert_array_equal(each.step.terminated[before], True)
-        assert lanes.num_active == (~lanes.ended).sum()
-        for lane in np.flatnonzero(lanes.ended):
+        assert lanes.num_active == lanes.active.sum()
+        for lane in np.flatnonzero(~lanes.active):
             ended_at.setdefault(lane, step)
         last = each.step.observation.copy()
     assert len(set(ended_at.values())) > 1
     np.testing.assert_array_equal(lanes.reset([0], [0])[1:], last[1:])
-    assert lanes.ended.tolist() == [False, True, True, True]
+    assert lanes.active.tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize("how", ["raises", "size", "nan", "huge", "reward"])

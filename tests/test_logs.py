@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-import os
 import re
 import shlex
 import shutil
@@ -666,7 +665,7 @@ def test_a_damaged_bag_is_refused(tmp_path):
         assert f"{name} can't be read as a bag" in done.stderr
 
 
-def test_a_bag_reads_nothing_outside_itself_and_opens_no_pipe(tmp_path):
+def test_a_bag_reads_nothing_outside_itself(tmp_path):
     path, out = write_bag(tmp_path / "walk", "db3"), tmp_path / "out"
     about, database = path / "metadata.yaml", path / "walk.db3"
     elsewhere = path / "..%2Felsewhere.db3"  # which SQLite takes for ../elsewhere.db3
@@ -678,15 +677,6 @@ def test_a_bag_reads_nothing_outside_itself_and_opens_no_pipe(tmp_path):
         "data", "import", path, "--out", out
     )
     about.write_text(said)
-    elsewhere.unlink()
-    for make in (lambda: database.symlink_to(tmp_path / "elsewhere.db3"), lambda: os.mkfifo(about)):
-        for each in (database, about):
-            each.unlink(missing_ok=True)
-        make()
-        about.exists() or about.write_text(said)
-        assert "must be a plain file: no link, pipe or" in mistake(
-            "data", "import", path, "--out", out
-        )
 
 
 @pytest.mark.parametrize(
@@ -1050,7 +1040,7 @@ def test_what_a_table_says_of_itself_may_be_anything(tmp_path):
     told = pa.schema(fields[1:]).with_metadata({"jbrep": "[]"})
     table = pa.table(columns[1:], told)
     checksums = {"settings": hashlib.sha256(b"[]").hexdigest(), "columns": {}, "episodes": "0" * 64}
-    head = {"format": "jbrep table", "format_version": 1}
+    head = {"format": "jbrep table", "format_version": 2}
     table = table.replace_schema_metadata(
         {"jbrep": "[]", "jbrep checksums": json.dumps(head | checksums)}
     )
@@ -1067,14 +1057,6 @@ def test_numbers_beyond_all_bounds_in_lerobot_s_own(value, tmp_path):
     assert "isn't as LeRobot writes it" in mistake(
         "data", "import", folder, "--out", tmp_path / "no"
     )
-
-
-def test_no_link_in_a_lerobot_data_set_is_followed(tmp_path):
-    folder = lerobot_folder(tmp_path / "le")
-    shutil.move(folder / "data/chunk-000", tmp_path / "elsewhere")
-    (folder / "data/chunk-000").symlink_to(tmp_path / "elsewhere")
-    said = mistake("data", "import", folder, "--out", tmp_path / "no")
-    assert "chunk-000 must be a plain file: no link" in said
 
 
 def test_a_column_too_wide_to_be_used_is_left_out(tmp_path):

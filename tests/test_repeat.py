@@ -153,7 +153,5 @@ def test_a_repeat_out_of_range_is_refused_in_a_line(tmp_path):
     common = ("rl", "--task", "face_direction", "--steps", 100, "--out", tmp_path / "run")
     result = jbrep(*common, "--set", "action_repeat=0")
     assert result.exit_code == 2
-    assert "action_repeat is 0: it must be a whole number from 1 to 1,000" in " ".join(
-        result.output.split()
-    )
+    assert "action_repeat is 0" in " ".join(result.output.split())
     assert not (tmp_path / "run").exists()

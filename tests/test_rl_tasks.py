@@ -165,7 +165,7 @@ def test_the_command_says_that_an_environment_failed(tmp_path):
 
 
 def broken(*_):
-    raise EnvironmentFailedError("out of order", 0)
+    raise EnvironmentFailedError("out of order")
 
 
 def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
@@ -190,7 +190,7 @@ def test_what_was_learned_outlives_an_environment_that_fails(algorithm, tmp_path
 
     def failing(lanes, actions):
         if next(count) == 60:
-            raise EnvironmentFailedError("the cable is loose", 0)
+            raise EnvironmentFailedError("the cable is loose")
         return step(lanes, actions)
 
     with monkeypatch.context() as patch:

@@ -394,9 +394,9 @@ def test_own_encoders_are_checked_before_the_first_run(own, message, home, tmp_p
     [
         ([{"name": "a", "file": "x"}, "full", {"name": "a", "file": "y"}], "each once"),
         ([{"name": "dae-8", "file": "x"}, "dae-8"], "each once"),
-        ([7], r"representations\[0\] is 7: it must be text or a table"),
+        ([7], r"representations\[0\] is 7"),
         *(([{"name": n, "file": "x"}], "name is") for n in ("full", "..", "a/b", "", 7, [])),
-        ([{"file": "x"}], "name is None: it must be a name of letters, digits"),
+        ([{"file": "x"}], "name is None"),
         *(
             ([{"name": "a", **rest}], "a: it must have a name and one of file, code, kind")
             for rest in ({}, {"noise": 0.2, "encoders": 2})
@@ -496,8 +496,8 @@ def test_a_run_on_an_object_resumes_with_the_same_object_alone(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"representation": "my encoder"}, "representation is 'my encoder': it must be a name"),
-        ({"encoder_seed": -1}, "encoder_seed is -1: it must be a whole number from 0"),
+        ({"representation": "my encoder"}, "representation is 'my encoder'"),
+        ({"encoder_seed": -1}, "encoder_seed is -1"),
     ],
 )
 def test_a_run_with_a_name_that_could_not_be_read_again_is_refused(settings, message):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.command import jbrep, mistake
 from helpers.small import brief
+from jbrep.rl.trainers import train_jobs
 
 from jbrep import worth
 from jbrep.collect import collect
@@ -24,7 +25,6 @@ from jbrep.records.lock import exclusive
 from jbrep.report.evaluation import evaluation_text
 from jbrep.report.worth import condition, conditioning
 from jbrep.rl.files import read_evaluations
-from jbrep.rl.trainers import train_jobs
 from jbrep.worth import add_worth, learned
 
 
@@ -128,7 +128,7 @@ def test_an_agent_whose_environment_fails_ends_alone(data, tmp_path, monkeypatch
 
     def fail_once(self, seeds):
         if next(numbers) == 0:
-            raise EnvironmentFailedError("no power", 0)
+            raise EnvironmentFailedError("no power")
         return reset(self, seeds)
 
     monkeypatch.setattr(AutoresetLanes, "reset", fail_once)

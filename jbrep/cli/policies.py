@@ -174,10 +174,10 @@ def _perturb(
 ) -> None:
     """Show the rows of a table as they are finished, and write those so far."""
     from jbrep.play.perturbed import HEADER, Table, domains_of, perturb
-    from jbrep.records.storage import check_writable
+    from jbrep.records.storage import make_folder
 
     if out:
-        check_writable(out.parent)
+        make_folder(out.parent)
     domains, lacking = domains_of(player.task, chosen)
     if lacking and not chosen:
         told = f"{player.task.name} has no {', '.join(lacking)} that could be changed"
@@ -357,7 +357,7 @@ def behaviour(
 
     from jbrep.play.behaviour import FAST, FIGURES, SPEEDS, fast_shares, observe
     from jbrep.play.sources import check_source
-    from jbrep.records.storage import check_writable, exists
+    from jbrep.records.storage import exists, make_folder
 
     if not np.isfinite(target_yaw):
         raise InputError(f"--target-yaw is {target_yaw}: it must be a number of degrees")
@@ -365,7 +365,7 @@ def behaviour(
     for policy in policies:
         if not exists(policy):
             check_source(policy)
-    check_writable(out, [f"{name}.png" for name in FIGURES])
+    make_folder(out, [f"{name}.png" for name in FIGURES])
     from jbrep.report.figures import behaviour_plots, write  # imports torch
 
     with stoppable("the same command starts again"):

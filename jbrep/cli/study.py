@@ -87,11 +87,10 @@ def study(
 
 def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> None:
     """Say what a study is going to do, or write it down before the first run."""
-    from jbrep.records.document import read_document
     from jbrep.report.statistics import forecast_text
     from jbrep.study import Plan, read_study, register_study
     from jbrep.study.forecast import forecast
-    from jbrep.study.registration import Registration
+    from jbrep.study.registration import registration_in
 
     plan = Plan(read_study(path), folder, path)
     expected = forecast(plan, workers) if dry_run else None
@@ -100,7 +99,7 @@ def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> N
     if expected:
         return click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
     registered = register_study(plan)
-    found = read_document(registered, Registration)
+    found = registration_in(registered)
     click.echo(f"registered on {found.date} (SHA-256 {found.sha256})")
     if plan.in_git:
         tell(f"Commit {registered.name}, then run the study: before, it is refused.", err=True)

@@ -29,12 +29,11 @@ from jbrep.dataset.manifest import (
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined, some_episodes
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.make import is_batched
-from jbrep.envs.task import changed_parts
 from jbrep.errors import DamageError, InputError, choose, differences
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
 from jbrep.records.record import to_plain
-from jbrep.records.storage import check_space, exists, make_folder, read_regular, write_whole
+from jbrep.records.storage import check_space, exists, make_folder, read_file, write_whole
 from jbrep.text import counted
 
 _MAX_SHARDS = 10_000
@@ -258,19 +257,13 @@ def _keep(files: Mapping[str, bytes], folder: Path) -> None:
         path = folder / name
         if not exists(path):
             write_whole(path, content)
-        elif read_regular(path, len(content)) != content:
+        elif read_file(path) != content:
             raise InputError(f"{path} is another policy's file: choose another folder")
 
 
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
     """Check that going on gives what an uninterrupted run gives."""
     steps, own = wanted.settings.steps, there.settings.steps
-    is_same = there.task.id == wanted.task.id
-    if is_same and (changed := changed_parts(there.task, wanted.task)):
-        raise InputError(
-            f"{folder} holds a data set of {there.task.name} as it was: {changed} changed since; "
-            "put that back, or choose another folder"
-        )
     differing = differences(_flat(there.settings), _flat(wanted.settings))
     if differing and _flat(there.settings) != {**_flat(wanted.settings), "steps": own}:
         raise InputError(

@@ -25,7 +25,6 @@ from jbrep.dataset.manifest import (
 from jbrep.dataset.shard import column_hashes
 from jbrep.dataset.verify import policy_files
 from jbrep.envs.lanes import check_counts
-from jbrep.envs.origin import changes_of
 from jbrep.errors import DamageError, InputError
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
@@ -141,11 +140,8 @@ def _restore(
             again = "; derive the data set again in another folder" if settings.task.view else ""
             raise InputError(f"{path} can't be restored: {error}{again}") from None
     if column_hashes(columns) != entry.sha256:
-        changed = changes_of(settings.task)
-        why = (
-            f"{changed} changed since; put that back"
-            if changed
-            else (f"use the machine it was made on, and these versions: {dict(manifest.versions)}")
+        raise InputError(
+            f"{path} can't be restored here: it comes out differently; use the robot as it was, on "
+            f"the machine it was made on, with these versions: {dict(manifest.versions)}"
         )
-        raise InputError(f"{path} can't be restored here: it comes out differently; {why}")
     return write_shard(folder, manifest, shard, columns)

@@ -25,7 +25,7 @@ from jbrep.errors import DamageError, InputError
 from jbrep.records.commit import Commits, commits
 from jbrep.records.document import Document, document_from, parse_json
 from jbrep.records.record import Record, Sha256, Version
-from jbrep.records.storage import MissingFileError, exists, read_regular, write_whole
+from jbrep.records.storage import MissingFileError, exists, read_file, write_whole
 
 MANIFEST = "manifest.json"
 BACKUP = "manifest.backup.json"
@@ -41,7 +41,7 @@ class Entry(Record, frozen=True, kw_only=True):
     bytes: _Count
     rows: _Count
     episodes: _Count
-    xxh3: Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z", title="an XXH3")]  # of the file
+    xxh3: Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z")]  # of the file
     sha256: Mapping[str, Sha256]  # of each column
 
 
@@ -50,7 +50,6 @@ class Manifest(Document, frozen=True, kw_only=True):
 
     format: ClassVar[str] = "jbrep data set"
     format_version: ClassVar[int] = 3
-    max_bytes: ClassVar[int] = 1 << 25  # each shard takes 1.5 kB of it
     indent: ClassVar[int] = 1
 
     settings: DataSettings
@@ -186,7 +185,7 @@ def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
     """
     path = folder / name
     try:
-        return _manifest_from(read_regular(path, Manifest.max_bytes), path)
+        return _manifest_from(read_file(path), path)
     except MissingFileError:
         raise _explain_missing(path) from None
     except DamageError as error:

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.envs.names import code_named
-from jbrep.envs.origin import code_behind
+from jbrep.envs.names import code_named, code_of
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line
 
@@ -49,7 +48,7 @@ def reward_function(code: str) -> Callable[[Array, Array], NDArray[np.float64]]:
 
 def with_hash(code: str) -> str:
     """The name of such a function with the hash of its code, as data of two codes differ."""
-    parts = sorted(code_behind(code_named(code, "reward")).items())
+    parts = sorted(code_of(code_named(code, "reward")).items())
     return f"{code} {hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]}"
 
 

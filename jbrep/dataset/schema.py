@@ -33,7 +33,6 @@ _Code = Annotated[
     Meta(
         pattern=r"(?a)\A[\w.]+:[\w.]+ [0-9a-f]{12}\Z",
         max_length=MAX_LETTERS,
-        title="module:function and a hash",
     ),
 ]
 

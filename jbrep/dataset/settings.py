@@ -17,14 +17,11 @@ MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 _MAX_CONSTANTS = 1000
 
 _Line = Annotated[str, Meta(max_length=MAX_LETTERS)]
-_Number = Annotated[float, Meta(gt=-(10**12), lt=10**12, title="a number")]
+_Number = Annotated[float, Meta(gt=-(10**12), lt=10**12)]
 _List = Annotated[tuple[_Number | _Line, ...], Meta(max_length=_MAX_CONSTANTS)]
-_POLICY = "a kind and its constants, such as {'kind': 'constant', 'drive': 0.5}"
-_Constants = Annotated[
-    Mapping[_Line, _Number | _Line | _List], Meta(max_length=_MAX_CONSTANTS, title=_POLICY)
-]
-PolicySettings = Annotated[Mapping[str, Any], Meta(title=_POLICY)]
-_Kind = Annotated[str, Meta(pattern=r"\A[a-z-]+\Z", title="a word of small letters")]
+_Constants = Annotated[Mapping[_Line, _Number | _Line | _List], Meta(max_length=_MAX_CONSTANTS)]
+PolicySettings = Mapping[str, Any]
+_Kind = Annotated[str, Meta(pattern=r"\A[a-z-]+\Z")]
 _Weight = Annotated[float, Meta(gt=0, lt=10**12)]
 
 
@@ -73,9 +70,7 @@ class _Trained(Record, frozen=True, kw_only=True):
     """The policy of a run, in a file beside the shards and nowhere else."""
 
     kind: Literal["trained"]
-    file: Annotated[
-        str, Meta(pattern=r"(?a)\Apolicy-\d{1,3}\.safetensors\Z", title="policy-0.safetensors")
-    ]
+    file: Annotated[str, Meta(pattern=r"(?a)\Apolicy-\d{1,3}\.safetensors\Z")]
     sha256: Sha256
     run: _Line
     step: Annotated[int, Meta(ge=0, lt=10**12)]

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.schema import EPISODES, Columns, Spec
 from jbrep.errors import DamageError, InputError
-from jbrep.records.storage import open_regular
 
 REPAIR = "run jbrep data repair to restore it"
 FileState = tuple[int, ...] | None  # see `file_state`
@@ -64,19 +63,17 @@ def map_file(path: Path) -> mmap.mmap:
     """Map a file into memory, read-only.
 
     Raises:
-        DamageError: there is no such file, or it is empty or not a regular file.
+        DamageError: there is no such file, or it is empty.
     """
     try:
-        if (file := open_regular(path)) is not None:
-            with file:
-                return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        with path.open("rb") as file:
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except FileNotFoundError:
         raise DamageError(f"{path} is missing: {REPAIR}") from None
-    except ValueError:  # it is empty
-        pass
+    except ValueError:
+        raise DamageError(f"{path} is damaged: it is empty; {REPAIR}") from None
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
-    raise DamageError(f"{path} is damaged: it must be a regular file, not empty and not a link")
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from jbrep.dataset.shard import REPAIR, column_hash
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
 from jbrep.progress import Progress
-from jbrep.records.storage import read_regular
+from jbrep.records.storage import read_file
 
 _MAX_POLICY_BYTES = 1 << 28
 
@@ -85,7 +85,7 @@ def policy_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:
     for policy in (each for each in parts_of(manifest.settings.policy) if each["kind"] == TRAINED):
         path, raw = folder / policy["file"], b""
         with suppress(InputError):
-            raw = read_regular(path, _MAX_POLICY_BYTES)
+            raw = read_file(path)
         if hashlib.sha256(raw).hexdigest() != policy["sha256"]:
             raise DamageError(
                 f"{path} is damaged or missing: it is the policy of {policy['run']} at step "

@@ -35,8 +35,6 @@ def _packed(encoder: Encoder, path: Path) -> bytes:
     try:
         _check_metrics(encoder.header)
         content = container.pack(encoder.tensors(), encoder.header.as_json())
-        if len(content) > container.MAX_BYTES:
-            raise InputError(f"{len(content):,} bytes are more than {container.MAX_BYTES:,}")
     except InputError as error:
         raise InputError(f"can't save an encoder in {path}: {error}") from None
     return content

@@ -143,7 +143,7 @@ def _bytes(path: Path) -> bytes:
     """The bytes of a regular file."""
     if not exists(path):
         raise InputError(f"no file {path}")
-    return read_file(path, _MAX_BYTES)
+    return read_file(path)
 
 
 def _input(graph: onnx.GraphProto, constants: Constants, size: int) -> tuple[str, int]:

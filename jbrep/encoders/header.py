@@ -19,7 +19,7 @@ HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has, unless it wa
 MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
 
 _Words = tuple[str, ...]
-_Steps = Annotated[str, Meta(pattern=r"\A[1-9][0-9]{0,8}\Z", title="a number of steps")]
+_Steps = Annotated[str, Meta(pattern=r"\A[1-9][0-9]{0,8}\Z")]
 
 
 class _Told(Record, frozen=True, kw_only=True, forbid_unknown_fields=False):
@@ -72,7 +72,7 @@ class EncoderHeader(Document, frozen=True):
         ),
     ] = ()
     clip: Annotated[
-        Annotated[float, Meta(ge=1, le=MAX_MAGNITUDE, title="a number from 1 to 1e12")] | None,
+        Annotated[float, Meta(ge=1, le=MAX_MAGNITUDE)] | None,
         Meta(description="The limit of scaled values."),
     ] = None
     keep: Annotated[

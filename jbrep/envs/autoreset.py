@@ -46,7 +46,7 @@ class AutoresetLanes:
     Args:
         task: whose environment is made.
         num_lanes: n.
-        num_threads: as for `Lanes`.
+        num_threads: threads to step a batch on.
         repeat: steps for which each action is held; fewer where an episode ends before.
         retries: of failures, each of which ends an episode, truncated, before the step that failed.
 
@@ -89,7 +89,7 @@ class AutoresetLanes:
         self._taken.append(actions)
         step, reward, non_finite = self._hold(actions)
         lost = self.lanes.steps == before
-        ended, observation, length = self.lanes.ended, step.observation, self.lanes.steps
+        ended, observation, length = ~self.lanes.active, step.observation, self.lanes.steps
         if ended.any():
             numbers = np.flatnonzero(ended).tolist()
             self._episodes[numbers] += 1

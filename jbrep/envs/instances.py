@@ -13,11 +13,10 @@ from typing import Any, NamedTuple
 import gymnasium
 from gymnasium.wrappers import TimeLimit
 
+from jbrep.envs.disturbed import Varied
 from jbrep.envs.domain import Domain
 from jbrep.envs.make import aside, make_env
-from jbrep.envs.names import find_spec
-from jbrep.envs.origin import files_of
-from jbrep.envs.varied import Varied
+from jbrep.envs.names import files_of, find_spec
 from jbrep.errors import Notice, kind_and_line
 
 Env = gymnasium.Env[Any, Any]

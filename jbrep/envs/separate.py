@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from jbrep.envs import instances
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
-from jbrep.envs.make import action_in, aside, flattener, number, of_size, reason
+from jbrep.envs.make import action_in, aside, flattener, number, of_size
 from jbrep.envs.task import Array, Task, most_held
-from jbrep.errors import InputError, Notice
+from jbrep.errors import InputError, Notice, kind_and_line
 
 Flags = NDArray[np.bool_]
 State = dict[str, NDArray[Any]]
@@ -20,33 +20,17 @@ _LARGEST = float(np.finfo(np.float32).max)  # that data sets and agents can have
 
 
 class EnvironmentFailedError(InputError):
-    """An environment raised an error, or gave something else than its task's description says.
-
-    Attributes:
-        lane: in which it did.
-    """
-
-    def __init__(self, message: str, lane: int):
-        super().__init__(message)
-        self.lane = lane
+    """An environment raised an error, or gave something else than its task's description says."""
 
 
 class Retries:
-    """How often what fails is tried again, in a row.
-
-    Args:
-        most: times.
-    """
+    """How often what fails is tried again, in a row."""
 
     def __init__(self, most: int = 0):
         self._most = self._left = most
 
     def failed(self, error: Exception) -> None:
-        """Tell of a failure.
-
-        Raises:
-            Exception: the error itself, if there were as many before.
-        """
+        """Tell of a failure, or raise it if there were as many before."""
         if not self._left:
             raise error
         self._left -= 1
@@ -112,7 +96,6 @@ class Separate:
     def reset(
         self, seed: Sequence[int | None], options: Mapping[str, Flags]
     ) -> tuple[Array, dict[str, Array]]:
-        """As a vector environment with `reset_mask`."""
         self._make_new_arrays()
         for lane in np.flatnonzero(options["reset_mask"]).tolist():
             self._begin(lane, seed[lane])
@@ -128,14 +111,11 @@ class Separate:
                 self.envs[lane] = self.envs[lane] or self._take()
                 with aside():
                     observation, info = self.envs[lane].reset(seed=seed)
-                if not isinstance(info, Mapping):
-                    raise ValueError("too many values to unpack (expected 2")  # old Gym's
                 return self._put(lane, observation, info)
             except Exception as error:
                 self._handle_failure(lane, error)
 
     def step(self, actions: Array) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
-        """As a vector environment."""
         chosen = self._active.copy()
         self._make_new_arrays()
         self._reward, self.lost = np.zeros(len(chosen)), np.zeros(len(chosen), np.bool_)
@@ -210,10 +190,7 @@ class Separate:
         if not after_step or self._held[lane] > most_held(self._task.missing or ""):
             raise EnvironmentFailedError(
                 f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
-                "reward that is not finite in 32 bits, at step "
-                f"{self._steps[lane]} of the episode with seed "
-                f"{self._seeds[lane]}; {self._missing_said}",
-                lane,
+                f"reward that is not finite in 32 bits, {self._where(lane)}; {self._missing_said}"
             )
         filled = np.where(missing, self._observation[lane], flat)
         return filled, self._last_reward[lane] if is_missing else reward
@@ -225,30 +202,26 @@ class Separate:
             return "no episode can end before its first step: give --missing hold:1, or more"
         return f"that is beyond --missing {missing}" if missing else "--missing says what to do"
 
+    def _where(self, lane: int) -> str:
+        return f"at step {self._steps[lane]} of the episode with seed {self._seeds[lane]}"
+
     def _lose(self, lane: int) -> None:
         """Let the episode of a lane end before the step that it just took."""
         self.lost[lane], self._reward[lane] = True, 0.0
         self._steps[lane] -= 1
 
     def _handle_failure(self, lane: int, error: Exception) -> None:
-        """Go on after a failure, with a new instance at the next reset.
-
-        Raises:
-            EnvironmentFailedError: there were too many.
-        """
+        """Go on after a failure, unless there were too many, with a new instance."""
         if self.envs[lane] is not None:
             instances.discard(self.envs[lane])
             self.envs[lane] = None
         if not isinstance(error, EnvironmentFailedError):
             error = EnvironmentFailedError(
-                f"{self._task.name} failed at step {self._steps[lane]} of the "
-                f"episode with seed {self._seeds[lane]}: {reason(error)}",
-                lane,
+                f"{self._task.name} failed {self._where(lane)}: {kind_and_line(error)}"
             )
         self._retries[lane].failed(error)
 
     def render(self) -> tuple[Any, ...]:
-        """As a vector environment."""
         with aside():
             return tuple(env.render() for env in self.envs)
 

@@ -106,12 +106,10 @@ class Seen:
         return getattr(self._batch, name)
 
     def reset(self, seed: Any, options: Mapping[str, Any]) -> tuple[Array, Any]:
-        """As the batch does."""
         given, info = self._batch.reset(seed=seed, options=options)
         return self._window.begin(np.flatnonzero(options["reset_mask"]), given), info
 
     def step(self, actions: Array) -> tuple[Any, ...]:
-        """As the batch does; what a step that is lost led to isn't seen."""
         given, *others = self._batch.step(actions)
         moved = ~getattr(self._batch, "lost", np.zeros(len(given), np.bool_))
         return self._window.step(moved, actions, given), *others

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from msgspec import UNSET, UnsetType
 
-from jbrep.records.document import Document, sealed
+from jbrep.records.document import Document
 from jbrep.records.record import Record
 from jbrep.stats.bootstrap import Interval
 
@@ -207,8 +207,7 @@ class Evaluation(Document, frozen=True, kw_only=True):
     """Encoders side by side, the full observation first."""
 
     format: ClassVar[str] = "jbrep evaluation"
-    format_version: ClassVar[int] = 3
-    max_bytes: ClassVar[int] = 1 << 28
+    format_version: ClassVar[int] = 4
     indent: ClassVar[int] = 1
 
     data: JudgedOn
@@ -226,7 +225,7 @@ class Evaluation(Document, frozen=True, kw_only=True):
 
     def text(self) -> str:
         """As JSON, with numbers of six digits and each list of numbers on one line."""
-        text = json.dumps(sealed(_rounded(self.as_json())), indent=self.indent)
+        text = json.dumps(_rounded(self.as_json()), indent=self.indent)
         parts = re.compile(r'"(?:[^"\\]|\\.)*"|\[[-+.,\deEnul\s]*\]')  # text stays as it is
 
         def on_one_line(part: re.Match[str]) -> str:

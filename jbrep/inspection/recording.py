@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jbrep.errors import InputError
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder, open_regular, write_whole
+from jbrep.records.storage import exists, make_folder, write_whole
 
 PROVENANCE = "provenance"
 SUFFIX = ".rrd"
@@ -128,7 +128,7 @@ def check_out(path: Path) -> None:
             raise InputError(f"a recording is a file such as {name}, not {path}")
         return
     try:
-        file = open_regular(path)
+        file = path.open("rb")
     except OSError as error:
         raise InputError(f"can't write {path}: {error.strerror or error}") from None
     with file or BytesIO() as content:

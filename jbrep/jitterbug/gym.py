@@ -316,7 +316,6 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         return self._observation
 
     def push(self, velocity: Array) -> None:
-        """As `jbrep.jitterbug.simulation.Simulation.push`."""
         self.simulation.push(velocity)
 
     def _restart(self, lanes: Sequence[int], options: Mapping[str, Any] = {}) -> None:

@@ -24,7 +24,7 @@ from jbrep.methods.shape import complete
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, inside, make_folder
+from jbrep.records.storage import exists, make_folder
 from jbrep.training import checkpoint
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method
 from jbrep.training.network import check_layers
@@ -178,7 +178,7 @@ class Fitter:
             case ClosedForm() as method:
                 self._save(plan, method.make(plan.data))
             case Learned() as method:
-                work = inside(self._folder, plan.path.with_suffix(".training").name)
+                work = plan.path.with_suffix(".training")
                 make_folder(work)
                 self._train(plan, method, work)
 

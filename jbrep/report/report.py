@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from jbrep.encoders.base import OWN
 from jbrep.evaluate.table import SCALARS
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, inside, make_folder, write_whole
+from jbrep.records.storage import exists, make_folder, write_whole
 from jbrep.report import facts
 from jbrep.report.answer import answer
 from jbrep.report.figures import study_plots, write
@@ -132,7 +132,7 @@ def write_report(tables: Tables, out: Path) -> list[Path]:
         SUMMARY: _json(_summary(tables), indent=1),
         MARKDOWN: markdown(tables, predictions, f"{FIGURES}/{_MAIN_FIGURE}.png"),
     }
-    write(plots, inside(out, FIGURES))
+    write(plots, out / FIGURES)
     if tables.analysis:
         texts[STATISTICS] = _json(statistics(tables.analysis), indent=2)
     else:

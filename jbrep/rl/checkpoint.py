@@ -45,7 +45,6 @@ from jbrep.rl.history import History
 from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_STEPS
 
-MAX_BYTES = 1 << 40
 PARAMETERS = "parameters."  # begins the names of what gradient steps change
 _LANES, _BUFFER = "lanes.", "buffer."  # likewise, of environments and of the replay buffer
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")  # of an agent
@@ -105,7 +104,7 @@ class Checkpoint(NamedTuple):
             DamageError: it isn't what was written.
         """
         path = folder / CHECKPOINT
-        tensors, header = container.read(path, "checkpoint", MAX_BYTES)
+        tensors, header = container.read(path, "checkpoint")
         return cls(path, document_from(header, path, Header), tensors)
 
     def restore(self, agent: BaseAlgorithm) -> None:

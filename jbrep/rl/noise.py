@@ -64,7 +64,3 @@ class ColouredNoise(Record, frozen=True, tag_field="kind", tag="coloured"):
 
 
 Noise = NormalNoise | OrnsteinUhlenbeckNoise | ColouredNoise
-EXAMPLES = (
-    'none, {"kind": "normal", "sigma": 0.1}, {"kind": "coloured", "beta": 1, "sigma": 0.2}, or '
-    '{"kind": "ornstein-uhlenbeck", "mean": 0, "sigma": 0.3, "theta": 0.15}'
-)

@@ -27,25 +27,12 @@ MAX_LINE = 1000  # letters
 MAX_NAME = 100  # letters of a learner's name
 
 Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
-Name = Annotated[
-    str,
-    Meta(
-        pattern=r"\A[\w.-]{1,100}\Z",
-        title="a name of letters, digits, dots, hyphens and underscores",
-    ),
-]
-LearnerName = Annotated[
-    str,
-    Meta(
-        pattern=rf"\A(?=.*[^.])[\w.+=-]{{1,{MAX_NAME}}}\Z",
-        title=f"at most {MAX_NAME} letters, digits and characters of . _ - + =",
-    ),
-]
+Name = Annotated[str, Meta(pattern=r"\A[\w.-]{1,100}\Z")]
+LearnerName = Annotated[str, Meta(pattern=rf"\A(?=.*[^.])[\w.+=-]{{1,{MAX_NAME}}}\Z")]
 Line = Annotated[  # nothing in it controls a terminal
     str,
     Meta(
-        pattern=rf"\A[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]{{0,{MAX_LINE}}}\Z",
-        title=f"a line of at most {MAX_LINE:,} letters",
+        pattern=rf"\A[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]{{0,{MAX_LINE}}}\Z"
     ),
 ]
 Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]

@@ -25,7 +25,7 @@ from jbrep.errors import InputError
 from jbrep.machine import cpu
 from jbrep.records.commit import commits
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, inside, make_folder, read_file, write_whole
+from jbrep.records.storage import exists, make_folder, read_file, write_whole
 from jbrep.records.tables import write_csv, write_rows
 from jbrep.rl.agent import (
     Evaluator,
@@ -67,7 +67,7 @@ from jbrep.rl.files import (
     read_run,
 )
 from jbrep.rl.history import History
-from jbrep.rl.policy_file import MAX_BYTES, read
+from jbrep.rl.policy_file import read
 from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
 from jbrep.rl.run_settings import RunSettings
@@ -189,7 +189,7 @@ def _train(job: _Job, resumes: bool) -> RunRecord:
     with _agent(job) as agent:
         if job.settings.begin_from:
             _begin(agent, job, is_new=not resumes)
-        scalars = Scalars(inside(job.folder, "tensorboard"), history.first_step)
+        scalars = Scalars(job.folder / "tensorboard", history.first_step)
         agent.set_logger(_Logger(job.settings, [scalars, *job.session.writers]))
         with closing(_Progress(job, history, checkpoint)) as progress:
             failed = _learn(agent, job.settings.agent_steps, progress)
@@ -224,7 +224,7 @@ def _begin(agent: BaseAlgorithm, job: _Job, is_new: bool) -> None:
     assert sha256 is not None
     if is_new:
         source = read(Path(job.run.begin_from) / POLICY, sha256).path
-        write_whole(path, read_file(source, MAX_BYTES))
+        write_whole(path, read_file(source))
     policy = read(path, sha256)
     fill_whole(policy, agent.policy)
     restore_statistics(agent, policy.tensors, path)

@@ -15,7 +15,7 @@ from jbrep.errors import InputError, differences
 from jbrep.records.document import Document, read_document
 from jbrep.records.lock import exclusive
 from jbrep.records.record import Version
-from jbrep.records.storage import exists, inside, make_folder, write_whole
+from jbrep.records.storage import exists, make_folder, write_whole
 from jbrep.rl.files import FINISHED, last_returns, read_evaluations
 from jbrep.rl.learner import preset_text
 from jbrep.rl.overrides import setting_names
@@ -47,7 +47,7 @@ class Search(Document, frozen=True, kw_only=True):
     """search.json: what is searched, by which all trials and their order are decided."""
 
     format = "jbrep search"
-    format_version = 1
+    format_version = 2
 
     settings: RunSettings  # that all trials begin with
     seeds: Annotated[int, Meta(ge=1)]  # runs of each trial
@@ -151,7 +151,7 @@ def _trial(
     asked = study.ask(_space(run))
     overrides = _overrides(asked.params)
     trained = run.replace(learner=run.learner.overridden(overrides))
-    own = inside(folder, f"trial-{number}")
+    own = folder / f"trial-{number}"
     value = _score(trained, range(run.seed, run.seed + seeds), own, stop)
     study.tell(asked, value, TrialState.FAIL if value is None else TrialState.COMPLETE)
     return Trial(number, overrides, value)
@@ -161,7 +161,7 @@ def _score(run: Run, seeds: range, folder: Path, stop: Callable[[], bool]) -> fl
     """The mean return of the last evaluations of a trial's runs; None if one failed."""
     last: list[float] = []
     for seed in seeds:
-        own = inside(folder, f"seed-{seed}")
+        own = folder / f"seed-{seed}"
         if train(run.replace(seed=seed), own, Session(stop=stop)).status != FINISHED:
             return None
         last += last_returns(read_evaluations(own))

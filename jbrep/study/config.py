@@ -41,13 +41,7 @@ from jbrep.text import slug
 
 _MOST_SEEDS = (1 << 16) - 1
 UNIFORM = Uniform.kind
-_DataName = Annotated[
-    str,
-    Meta(
-        pattern=r"\A(?=.*[^.])[A-Za-z0-9_.-]{1,100}\Z",
-        title="a name of letters, digits, dots, hyphens and underscores",
-    ),
-]
+_DataName = Annotated[str, Meta(pattern=r"\A(?=.*[^.])[A-Za-z0-9_.-]{1,100}\Z")]
 
 
 class Data(Record, frozen=True, kw_only=True):
@@ -109,13 +103,12 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep study"
-    format_version = 3
+    format_version = 4
 
     tasks: Annotated[
         tuple[str, ...],
         Meta(
             min_length=1,
-            title="a list of names",
             description="The Jitterbug's by name, others by their Gymnasium ids.",
         ),
     ]
@@ -123,7 +116,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         tuple[str, ...],
         Meta(
             min_length=1,
-            title="a list of names, or tables",
             description="ddpg, td3, sac, ppo, a2c, trpo, tqc, crossq, each also with a preset, "
             "sac-modern; or a table of settings for each.",
         ),
@@ -132,7 +124,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         tuple[Given, ...],
         Meta(
             min_length=1,
-            title="a list of names and tables",
             description="full, encoders by name, or tables: name with file, code, kind and its "
             "settings, or encoders.",
         ),
@@ -141,8 +132,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         tuple[Seed, ...],
         Meta(
             min_length=1,
-            title=f"a list of whole numbers, or how many (1 to {_MOST_SEEDS:,})",
-            description="Of the runs.",
+            description="Of the runs, or how many.",
         ),
     ]
     episode_steps: Annotated[
@@ -154,12 +144,9 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     ] = {}
     domain: Annotated[
         Mapping[str, Any] | UnsetType,
-        Meta(
-            title="a table",
-            description='What each episode of all runs draws, such as delay = "0..2".',
-        ),
+        Meta(description='What each episode of all runs draws, such as delay = "0..2".'),
     ] = UNSET
-    data: Annotated[Mapping[str, Any] | None, Meta(title="a table")] = None  # see `named_data`
+    data: Mapping[str, Any] | None = None  # see `named_data`
     training: Annotated[
         Mapping[str, Any],
         Meta(
@@ -172,7 +159,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     evaluations: Annotated[
         tuple[str, ...],
         Meta(
-            title="a list of folders",
             description="From jbrep evaluate, whose diagnostics the report sets against returns; "
             "{task} stands for each task's name.",
         ),

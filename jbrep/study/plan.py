@@ -14,7 +14,7 @@ from jbrep.errors import InputError, differences
 from jbrep.records.commit import in_work_tree
 from jbrep.records.document import read_document
 from jbrep.records.record import to_plain
-from jbrep.records.storage import exists, inside, make_folder
+from jbrep.records.storage import exists, make_folder
 from jbrep.rl import Run
 from jbrep.rl.files import RUN, RunRecord
 from jbrep.rl.learner import Learner
@@ -96,7 +96,7 @@ class Plan:
 
     def folder_of(self, cell: Cell) -> Path:
         """A run's folder."""
-        return inside(self.folder, "runs", cell.name)
+        return self.folder / "runs" / cell.name
 
     def has_ended(self, cell: Cell) -> bool:
         """Whether a run has finished or failed."""
@@ -176,7 +176,7 @@ class Plan:
 
     def encoders(self, task: str) -> Path:
         """The folder of the encoders that the study trains for a task."""
-        return inside(self.folder, "encoders", slug(task))
+        return self.folder / "encoders" / slug(task)
 
     def data(self, task: str, number: int = 0, name: str = "") -> Path:
         """The folder of a data set that the study collects for a task, one of several or alone.
@@ -188,7 +188,7 @@ class Plan:
         """
         several = name in self.study.named_data and self.study.sets(name) > 1
         of_set = [f"set-{number}"] if several else []
-        return inside(self.folder, "data", *([name] if name else []), slug(task), *of_set)
+        return self.folder.joinpath("data", *([name] if name else []), slug(task), *of_set)
 
     def check_folder(self) -> None:
         """Check that the folder is free, or holds this study."""

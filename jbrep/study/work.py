@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError, first_line
-from jbrep.records.storage import make_folder, read_regular, write_note
+from jbrep.records.storage import make_folder, read_file, write_note
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.history import History
 from jbrep.text import rounded
@@ -77,7 +77,7 @@ def _crashed(assigned: Assigned, error: Exception) -> Outcome:
 def read_progress(folder: Path) -> tuple[int, str]:
     """The steps that a run has done, and the mean return of its last evaluation as text."""
     with suppress(InputError, ValueError):
-        step, mean = read_regular(folder / PROGRESS, _MOST_PROGRESS).decode().split()
+        step, mean = read_file(folder / PROGRESS).decode().split()
         return int(step), mean
     return 0, "-"
 

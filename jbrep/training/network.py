@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from jbrep.encoders import Layer
 from jbrep.encoders.layers import AVG_L1_NORM, MAX_UNITS, activate
 from jbrep.errors import InputError, choose
-from jbrep.records.container import MAX_BYTES
 
 
 class AvgL1Norm(nn.Module):
@@ -27,6 +26,7 @@ class AvgL1Norm(nn.Module):
 
 _MODULES = {"relu": nn.ReLU, "tanh": nn.Tanh, AVG_L1_NORM: AvgL1Norm}
 _SIZES = re.compile(r"[1-9][0-9]{0,8}([x,][1-9][0-9]{0,8})*")
+_MOST_BYTES = 1 << 24  # of an encoder's file
 _BYTES = 4  # of a number in float32
 HIDDEN = 64  # units of each of a predictor's two hidden layers
 _NAMES = {module: name for name, module in _MODULES.items()}
@@ -81,10 +81,10 @@ def check_size(name: str, size: int, latent: int) -> None:
     architecture = get_architecture(name)
     widths = (size, *architecture.hidden, latent)
     needed = 2 * _BYTES * sum(before * after for before, after in pairwise(widths))
-    if needed > MAX_BYTES:
+    if needed > _MOST_BYTES:
         raise InputError(
             f"architecture {architecture.name} has weights of {needed:,} bytes with {size} "
-            f"features: an encoder's file has at most {MAX_BYTES:,}; choose smaller sizes"
+            f"features: an encoder's file has at most {_MOST_BYTES:,}; choose smaller sizes"
         )
 
 
@@ -93,10 +93,10 @@ def check_layers(*parts: Sequence[Layer] | None) -> None:
     every = [layer for part in parts for layer in part or ()]
     needed = _BYTES * sum(layer.weight.size + layer.bias.size for layer in every)
     widest = max((len(layer.bias) for layer in every), default=0)
-    if needed > MAX_BYTES or widest > MAX_UNITS:
+    if needed > _MOST_BYTES or widest > MAX_UNITS:
         raise InputError(
             f"its layers have {needed:,} bytes and up to {widest:,} units: an encoder's file has "
-            f"at most {MAX_BYTES:,} and {MAX_UNITS:,}; choose a smaller latent size"
+            f"at most {_MOST_BYTES:,} and {MAX_UNITS:,}; choose a smaller latent size"
         )
 
 
