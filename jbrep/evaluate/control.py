@@ -11,9 +11,10 @@ from scipy.signal import lfilter
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders.base import BaseEncoder
-from jbrep.evaluate.evaluation import Action, Lost, Score, Scores, nearest_horizon
+from jbrep.evaluate.evaluation import Lost, Score, Scores, nearest_horizon
 from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
 from jbrep.evaluate.prediction import Matters, following
+from jbrep.evaluate.registry import Judged, Scalar, diagnostic
 from jbrep.evaluate.regression import Networks, Predictor, Problem, ridge
 from jbrep.stats.bootstrap import Array, by_episode
 
@@ -121,40 +122,37 @@ def _named(states: States) -> list[tuple[str, NDArray[np.bool_]]]:
     return [(f"value {number}", judged) for number, judged in enumerate(states.folds)]
 
 
-def value(
-    encoder: BaseEncoder, policy: GoodPolicy | None, predictors: Mapping[str, Predictor]
-) -> Score | None:
+@diagnostic(Scalar("value", "R² of a good policy's return to go", is_first=True))
+def value(e: Judged) -> Score | None:
     """R^2 of the policy's return to go, discounted by .99, from the latent, nonlinearly.
 
-    By cross-validation: each third of its episodes is judged by what was fitted to the others; None
-    without them. The last 300 steps of an episode are left out unless a state ended it.
+    By cross-validation: each third of its episodes is judged by what was fitted to the others. The
+    last 300 steps of an episode are left out unless a state ended it.
     """
-    if policy is None or policy.states is None:
+    if e.policy is None or e.policy.states is None:
         return None
-    states = policy.states
-    latent, predicted = encoder.encode(states.observation), np.empty_like(states.value)
+    states = e.policy.states
+    latent, predicted = e.encoder.encode(states.observation), np.empty_like(states.value)
     for name, judged in _named(states):
-        predicted[judged] = predictors[name](latent[judged])
+        predicted[judged] = e.learnt.of_policy[name](latent[judged])
     return explained(predicted, states.value, states.rows, states)[0]
 
 
-def action(
-    encoder: BaseEncoder,
-    held_out: HeldOut,
-    policy: GoodPolicy | None,
-    predictors: Mapping[str, Predictor],
-) -> Action | None:
-    """R^2 of what the policy would do in held-out rows, from the latent: linear and nonlinear."""
-    if policy is None:
-        return None
-    seen, taken, _ = held_out.once(_acting, policy, "train")
-    unseen, true, rows = held_out.once(_acting, policy, "test")
-    latent = encoder.encode(unseen)
-    linear, nonlinear = ridge(encoder.encode(seen), taken)(latent), predictors["action"](latent)
-    return Action(
-        linear=explained(linear, true, rows, held_out)[0],
-        nonlinear=explained(nonlinear, true, rows, held_out)[0],
-    )
+@diagnostic(
+    Scalar("action", "R² of a good policy's action", is_first=True),
+    Scalar("action_linear", "the same, linear"),
+)
+def action(e: Judged) -> tuple[Score | None, Score | None]:
+    """R^2 of what the policy would do in held-out rows, from the latent."""
+    if e.policy is None:
+        return None, None
+    seen, taken, _ = e.held_out.once(_acting, e.policy, "train")
+    unseen, true, rows = e.held_out.once(_acting, e.policy, "test")
+    latent = e.encoder.encode(unseen)
+    linear = ridge(e.encoder.encode(seen), taken)(latent)
+    nonlinear = e.learnt.of_policy["action"](latent)
+    found = (explained(each, true, rows, e.held_out)[0] for each in (nonlinear, linear))
+    return next(found), next(found)
 
 
 def _acting(

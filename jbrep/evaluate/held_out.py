@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
-from itertools import pairwise
 from threading import Lock
 from typing import Any, Protocol, TypeVar
 
@@ -19,7 +18,7 @@ from jbrep.stats.bootstrap import Array, bootstrap, by_episode, r_squared, varia
 Rows = NDArray[np.int64]
 _T = TypeVar("_T")
 
-MAX_GROUPS = 1000  # of episodes, to resample
+_MAX_GROUPS = 1000  # of episodes, to resample
 MAX_NUMBERS = 1 << 23  # in an array of sampled rows: 64 MiB
 
 
@@ -50,7 +49,7 @@ class HeldOut:
         self.hidden = hidden_of(data.dataset, truth) if truth else ()
         self._ends = np.cumsum(data.dataset.episodes["length"], dtype=np.int64)
         self.numbers = np.unique(self._episode(data.test))
-        self.num_groups = min(len(self.numbers), MAX_GROUPS)
+        self.num_groups = min(len(self.numbers), _MAX_GROUPS)
         self._found: dict[tuple[Any, ...], Any] = {}
         self._lock = Lock()
 
@@ -62,9 +61,6 @@ class HeldOut:
             found: _T = self._found[compute, *given]
         return found
 
-    def __len__(self) -> int:
-        return len(self.numbers)
-
     def truth(self, rows: Rows) -> Columns:
         """What isn't seen in rows, (n, k) by its name; angles as cosine and sine."""
         if not self._truth:
@@ -75,17 +71,9 @@ class HeldOut:
     def _episode(self, rows: Rows) -> Rows:
         return np.searchsorted(self._ends, rows, side="right")
 
-    def place(self, rows: Rows) -> Rows:
-        """The position of each held-out row's episode among the held-out ones, (n,)."""
-        return np.searchsorted(self.numbers, self._episode(rows))
-
     def _group(self, rows: Rows) -> Rows:
-        return self.place(rows) * self.num_groups // len(self)
-
-    def slices(self, rows: Rows) -> list[slice]:
-        """Where the rows of each group are among these."""
-        bounds = np.searchsorted(self._group(rows), np.arange(self.num_groups + 1)).tolist()
-        return [slice(*pair) for pair in pairwise(bounds)]
+        place = np.searchsorted(self.numbers, self._episode(rows))  # among those held out
+        return place * self.num_groups // len(self.numbers)
 
     def followed(self, rows: Rows) -> Rows:
         """Those rows whose next row belongs to the same episode."""

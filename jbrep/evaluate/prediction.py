@@ -11,8 +11,9 @@ from jbrep.coordinates import wrapped
 from jbrep.dataset import Column, ScaledDataset
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
-from jbrep.evaluate.evaluation import Prediction
+from jbrep.evaluate.evaluation import Prediction, Score
 from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
+from jbrep.evaluate.registry import Judged, Scalar, diagnostic
 from jbrep.evaluate.regression import Predictor, Problem
 from jbrep.training.windows import first_rows
 
@@ -85,6 +86,31 @@ def prediction(
             rewarded=None if matters is None else each[-1],
         )
     return results
+
+
+@diagnostic(
+    Scalar("forward", "R² of the features' change over 10 steps", is_first=True),
+    Scalar(
+        "rewarded",
+        "R² of the change over 10 steps of what the reward depends on",
+        is_first=True,
+    ),
+    Scalar("reward", "R² of the mean reward of 10 steps", is_first=True),
+)
+def at_once(e: Judged) -> tuple[Score | None, ...]:
+    """As `prediction` has them 10 steps ahead, or as near to that as episodes allow."""
+    return e.known.ahead("mean"), e.known.ahead("rewarded"), e.known.ahead("reward")
+
+
+@diagnostic(
+    Scalar("forward_1", "R² of the features' change over 1 step"),
+    Scalar("forward_5", "the same over 5 steps"),
+    Scalar("forward_20", "the same over 20 steps"),
+)
+def at_other_horizons(e: Judged) -> list[Score | None]:
+    """As `prediction` has them; None where episodes are too short."""
+    found = [e.known.prediction.get(str(steps)) for steps in (1, 5, 20)]
+    return [each.mean if each else None for each in found]
 
 
 def problems(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, tuple[Problem, Problem]]:

@@ -1,9 +1,5 @@
 """The ground truth of a robot, computed from its observations: what a latent is searched for."""
 
-from collections.abc import Callable
-from functools import partial
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -13,18 +9,7 @@ from jbrep.jitterbug.tasks import TASKS
 Columns = dict[str, Array]
 
 _ROTATION = ("orientation_w", "orientation_x", "orientation_y", "orientation_z")
-
-
-class _Truth(NamedTuple):
-    """The ground truth of a task.
-
-    Attributes:
-        quantities: computed from the features (n,) by name, (n, k) each.
-        replaced: the features that the quantities say everything about.
-    """
-
-    quantities: Callable[[Columns], Columns]
-    replaced: frozenset[str]
+_NEEDED = {*_ROTATION, "velocity_x", "velocity_y", "motor_angle"}  # features, for the quantities
 
 
 def quantities(task: Task, observation: ArrayLike) -> Columns:
@@ -36,7 +21,8 @@ def quantities(task: Task, observation: ArrayLike) -> Columns:
     target's position from the face, counter-clockwise. Of any other robot: every feature; it is an
     angle if its unit is rad and it is bounded to one turn.
     """
-    return _truth(task).quantities(_features(task, observation))
+    is_known = task.name in TASKS and {*task.feature_names} >= _NEEDED and not task.offset.any()
+    return _jitterbug(_features(task, observation)) if is_known else every(task, observation)
 
 
 def quantities_and_features(task: Task, observation: ArrayLike) -> Columns:
@@ -47,42 +33,16 @@ def quantities_and_features(task: Task, observation: ArrayLike) -> Columns:
 
 def every(task: Task, observation: ArrayLike) -> Columns:
     """All features, (n, k) by name: angles as cosine and sine."""
-    return _every(_features(task, observation), _angles(task))
-
-
-def state(task: Task, observation: ArrayLike) -> Columns:
-    """The whole state as columns (n,) by name: the quantities above and all other features."""
-    features, truth = _features(task, observation), _truth(task)
-    columns: Columns = {}
-    for name, values in truth.quantities(features).items():
-        endings = ("_cos", "_sin") if values.shape[1] == 2 else ("",)
-        columns |= {name + end: column for end, column in zip(endings, values.T, strict=True)}
-    others = features.keys() - truth.replaced
-    return columns | {name: features[name] for name in features if name in others}
-
-
-def _truth(task: Task) -> _Truth:
-    """A task's own ground truth, unless its features have other names or offsets; or every one."""
-    everything = frozenset(task.feature_names)
-    if task.name in _TRUTHS and everything >= _NEEDED and not task.offset.any():
-        return _TRUTHS[task.name]
-    return _Truth(partial(_every, angles=_angles(task)), everything)
-
-
-def _angles(task: Task) -> frozenset[str]:
-    return frozenset(feature.name for feature in task.features if feature.is_full_turn)
+    angles = {feature.name for feature in task.features if feature.is_full_turn}
+    return {
+        name: _on_circle(column) if name in angles else column[:, None]
+        for name, column in _features(task, observation).items()
+    }
 
 
 def _features(task: Task, observation: ArrayLike) -> Columns:
     columns = np.asarray(observation, np.float64).T
     return dict(zip(task.feature_names, columns, strict=True))
-
-
-def _every(features: Columns, angles: frozenset[str]) -> Columns:
-    return {
-        name: _on_circle(column) if name in angles else column[:, None]
-        for name, column in features.items()
-    }
 
 
 def _jitterbug(f: Columns) -> Columns:
@@ -100,12 +60,6 @@ def _jitterbug(f: Columns) -> Columns:
     if "target_x" in f:
         columns["bearing_of_target"] = _direction(-f["target_y"], f["target_x"])
     return columns
-
-
-_NEEDED = frozenset((*_ROTATION, "velocity_x", "velocity_y", "motor_angle"))
-_TRUTHS = dict.fromkeys(
-    TASKS, _Truth(_jitterbug, frozenset((*_ROTATION, "motor_angle", "angle_to_target")))
-)
 
 
 def _on_circle(angle: Array) -> Array:

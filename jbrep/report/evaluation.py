@@ -1,15 +1,13 @@
 """An evaluation of encoders as tables to read on a screen."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from jbrep.encoders import FULL
-from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Score, Scores, Worth
-from jbrep.evaluate.table import SCALARS
+from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Score, Scores
+from jbrep.evaluate.table import SCALARS, Scalar
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.report.serving import falling_short, lacking, serving, unreadable, untold
-from jbrep.report.worth import advice, conditioning, ranked
-from jbrep.report.worth import title as worth_title
-from jbrep.text import SIGNIFICANT, Table, counted, facts, html, interval, number, r2_text, wrapped
+from jbrep.text import SIGNIFICANT, Table, counted, facts, html, number, r2_text, wrapped
 
 _Encoders = Mapping[str, Diagnostics]  # by label
 
@@ -24,18 +22,8 @@ _WORDS = {
     "angular_velocity_z": "rate of yaw",
 }
 
-_COLUMNS: dict[str, tuple[str, Callable[[Diagnostics], Score | None]]] = {  # of the headline
-    "forward": ("the features' change over {}, from code and actions", lambda e: e.ahead("mean")),
-    "rewarded": ("of that, what the reward depends on", lambda e: e.ahead("rewarded")),
-    "reward": ("the mean reward of these steps", lambda e: e.ahead("reward")),
-    "value": ("the discounted return to go", SCALARS["value"].read),
-    "action": ("the action", SCALARS["action"].read),
-}
-_OF_POLICY = ("value", "action")
 _LACKING = "What each lacks of what a controller needs (R² of reading it below .5)"
 _NOTHING_NOW = "nothing: it can all be read now, but what becomes of it less well"
-_UNKNOWN = Score(None, None, None)
-_NOISE = 0.1  # the level of corruption that is shown
 _MANY = 8  # quantities from which probes are summed up
 
 
@@ -47,9 +35,9 @@ def evaluation_text(
         part.text(width) if isinstance(part, Table) else part for part in _parts(evaluation, width)
     ]
     if everything:
-        encoders = evaluation.encoders
-        tables = _errors(evaluation), _readings(encoders), _units(encoders)
-        parts += [_columns(evaluation, width), *(each.text(width) for each in tables)]
+        tables = _readings(evaluation.encoders), _scores(evaluation.encoders)
+        parts += [each.text(width) for each in tables]
+        parts.append(_words(evaluation, width))
     return "\n\n".join(parts)
 
 
@@ -59,43 +47,40 @@ def evaluation_html(evaluation: Evaluation) -> str:
 
 
 def _parts(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
-    """What tells codes that serve from others; first what they are worth, if that is known."""
-    tables = _headline(evaluation), *_unseen(evaluation)
-    if evaluation.worth and evaluation.worth.returns:
-        yield _worths(evaluation, evaluation.worth, width)
-        yield from tables
-    else:
-        yield wrapped(serving(evaluation), width)
-        yield from tables
-        yield _lacking(evaluation, width)
+    """What tells codes that serve from others."""
+    yield wrapped(serving(evaluation), width)
+    yield _headline(evaluation)
+    yield from _unseen(evaluation)
+    yield _lacking(evaluation, width)
 
 
 def _headline(evaluation: Evaluation) -> Table:
     """What tells codes that serve from others: columns of which anything is known."""
-    data = evaluation.data
-    scores = {
-        label: {name: read(known) or _UNKNOWN for name, (_, read) in _COLUMNS.items()}
-        for label, known in evaluation.encoders.items()
-    }
-    shown = [name for name in _COLUMNS if any(e[name].value is not None for e in scores.values())]
+    data, encoders = evaluation.data, evaluation.encoders
+    shown = [
+        each
+        for each in SCALARS.values()
+        if each.is_first and any(_value(each, e) is not None for e in encoders.values())
+    ]
     return Table(
         f"R² on {counted(data.test_episodes, 'held-out episode')} ({data.test_rows:,} steps), "
         "nonlinear (1: all, 0: nothing)",
-        ("encoder", "size", *shown),
+        ("encoder", "size", *(each.name for each in shown)),
         [
-            (
-                label,
-                str(evaluation.encoders[label].latent),
-                *(_told(each[name], name) for name in shown),
-            )
-            for label, each in scores.items()
+            (label, str(e.latent), *(_told(each.read(e), each.name) for each in shown))
+            for label, e in encoders.items()
         ],
     )
 
 
-def _told(score: Score, name: str) -> str:
+def _value(scalar: Scalar, known: Diagnostics) -> float | None:
+    score = scalar.read(known)
+    return score.value if score else None
+
+
+def _told(score: Score | None, name: str) -> str:
     """An R² of the headline; that by which codes are chosen with its interval."""
-    value, low, high = score
+    value, low, high = score or Score(None)
     is_chosen_by = name == "rewarded" and low is not None
     return r2_text(value) + (f" [{r2_text(low)}, {r2_text(high)}]" if is_chosen_by else "")
 
@@ -119,32 +104,12 @@ def _unseen(evaluation: Evaluation) -> Iterator[Table]:
         )
 
 
-def _columns(evaluation: Evaluation, width: int | None) -> str:
-    """What the columns of the headline are."""
-    steps = counted(evaluation.encoders[FULL].horizon or 0, "step")
-    named = {
-        name: words.format(steps) + (f" of {evaluation.policy}" if name in _OF_POLICY else "")
-        for name, (words, _) in _COLUMNS.items()
-        if evaluation.policy or name not in _OF_POLICY
-    }
-    return facts(named, width, indent=0)
-
-
-def _worths(evaluation: Evaluation, worth: Worth, width: int | None) -> str:
-    """Which code to take, and a line for each: its mean return, and why it isn't more."""
-    found = ranked(worth)
-    lacks = {} if untold(evaluation) else _lacks(evaluation)
-    lines = {}
-    for label in found.means:
-        why = [f"lacks {lacks[label]}"] if lacks.get(label) else []
-        if label not in found.best:
-            why += filter(None, [conditioning(evaluation.encoders[label].latent_units)])
-            why = why or ["why isn't known"]
-        lines[label] = "; ".join((interval(worth.returns[label], SIGNIFICANT), *why))
-    title = worth_title(worth) + (f". {_LACKING}" if lacks else "")
-    told = facts(lines, width, indent=0)
-    advised = wrapped(advice(evaluation, found), width) + "\n"
-    return "\n".join((advised, wrapped(title, width), told, *_unsaid(evaluation, width)))
+def _words(evaluation: Evaluation, width: int | None) -> str:
+    """What each diagnostic is; of the headline for as many steps as episodes allow."""
+    words = {each.name: each.words for each in SCALARS.values()}
+    steps = evaluation.encoders[FULL].horizon
+    short = f"\nEpisodes allow to look {steps} steps ahead in place of 10." if steps != 10 else ""
+    return facts(words, width, indent=0) + short
 
 
 def _lacking(evaluation: Evaluation, width: int | None) -> str:
@@ -191,63 +156,25 @@ def in_words(task: str, feature: str) -> str:
     return words.get(feature, feature)
 
 
-def _errors(evaluation: Evaluation) -> Table:
-    data = evaluation.data
-    header = ("encoder", "l", "error", "times PCA's", f"from noise {_NOISE}", "best linear")
-    rows = []
-    for label, known in evaluation.encoders.items():
-        error = known.reconstruction
-        if label == FULL:
-            continue
-        if error is None or known.corruption is None:
-            rows.append((label, str(known.latent), *["-"] * (len(header) - 1)))
-            continue
-        noisy = next(each for each in known.corruption if each.noise == _NOISE)
-        worst = min(error.features, key=lambda f: (f.r2.value is None, f.r2.value))
-        rows.append(
-            (
-                label,
-                str(known.latent),
-                interval(error.mse, ".5f"),
-                interval(error.ratio_to_pca, ".3f") if error.ratio_to_pca else "-",
-                number(noisy.mse.value, ".5f"),
-                number(noisy.linear_mse.value, ".5f"),
-                f"{worst.name} {r2_text(worst.r2.value)}",
-            )
-        )
+def _readings(encoders: _Encoders) -> Table:
+    probes = {label: _probes(known.probes) for label, known in encoders.items()}
     return Table(
-        f"Error on {counted(data.test_episodes, 'held-out episode')} of {data.task} "
-        f"({data.test_rows:,} rows), features scaled to [-1, 1], with 95 % intervals over "
-        "episodes",
-        (*header, "worst feature, R²"),
-        rows,
+        "What can be read from the latent: R² of linear probes",
+        ("encoder", *probes[FULL]),
+        [(label, *probes[label].values()) for label in encoders],
     )
 
 
-def _drawn(encoders: _Encoders) -> str:
-    """How many dimensions of the state the GTC looks at, if not at all."""
-    gtc = encoders[FULL].correlation
-    judged, whole = len(gtc.dimensions), gtc.state_dimensions
-    return f"; {judged} of its {whole} dimensions" if judged < whole else ""
-
-
-def _readings(encoders: _Encoders) -> Table:
-    probes = {label: _probes(known.probes) for label, known in encoders.items()}
-    rows = [
-        (
-            label,
-            *probes[label].values(),
-            number(known.neighbours.mse.value, ".2f"),
-            number(known.correlation.mean.value, ".2f"),
-            r2_text(known.dynamics.linear.value),
-        )
-        for label, known in encoders.items()
-    ]
+def _scores(encoders: _Encoders) -> Table:
+    """All diagnostics but those of the headline, a row each."""
     return Table(
-        "What can be read from the latent: R² of linear probes; KNN-MSE (2: nothing); GTC (1: the "
-        f"units are the state itself{_drawn(encoders)}); R² of the next latent, whitened",
-        ("encoder", *probes[FULL], "KNN-MSE", "GTC", "next"),
-        rows,
+        "All other diagnostics",
+        ("diagnostic", *encoders),
+        [
+            (each.name, *(number(_value(each, e), SIGNIFICANT) for e in encoders.values()))
+            for each in SCALARS.values()
+            if not each.is_first
+        ],
     )
 
 
@@ -263,18 +190,3 @@ def _probes(scores: Scores) -> dict[str, str]:
         "probes, mean": r2_text(sum(known.values()) / len(known)),
         "worst probe": f"{worst} {r2_text(known[worst])}",
     }
-
-
-def _units(encoders: _Encoders) -> Table:
-    return Table.of(
-        "Latent units: dead ones, the most saturated one, participation ratio, intrinsic dimension",
-        [(label, known.latent_units) for label, known in encoders.items()],
-        {
-            "encoder": lambda each: each[0],
-            "dead": lambda each: str(len(each[1].dead)),
-            "saturated": lambda each: number(max(each[1].saturation or (), default=None), ".0%"),
-            "participation": lambda each: number(each[1].participation_ratio, ".1f"),
-            "TwoNN": lambda each: number(each[1].intrinsic_dimension.two_nn, ".1f"),
-            "max. likelihood": lambda each: number(each[1].intrinsic_dimension.mle, ".1f"),
-        },
-    )
