@@ -1,5 +1,7 @@
 """Studies: many agents, and what the statistics say of them."""
 
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,10 +11,13 @@ from jbrep.cli.base import PATH, RESUMES, as_json
 from jbrep.cli.environment import import_option
 from jbrep.cli.output import echo_json, echo_paths, echo_text, say, tell
 from jbrep.cli.signals import stoppable
-from jbrep.text import terminal_width
+from jbrep.text import Table, duration, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.report.report import Report
+    from jbrep.report.views import Cells
+    from jbrep.stats.rules import Planned
+    from jbrep.study.packing import Forecast
 
 _COUNT = click.IntRange(1, 1024)
 
@@ -96,7 +101,6 @@ def _announce(
 ) -> None:
     """Say what a study is going to do, or write it down before the first run."""
     from jbrep.records.document import read_document
-    from jbrep.report.statistics import forecast_text
     from jbrep.study import Plan, read_study, register_study
     from jbrep.study.packing import forecast
     from jbrep.study.registration import Registration
@@ -106,13 +110,59 @@ def _announce(
     for notice in plan.study.notices:
         tell(notice, err=True)
     if expected:
-        return click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
+        return click.echo(_forecast_text(expected, plan.study.planned, terminal_width()))
     registered = register_study(plan)
     found = read_document(registered, Registration)
     click.echo(f"registered on {found.date} (SHA-256 {found.sha256})")
     if plan.in_git:
         tell(f"Commit {registered.name}, then run the study: before, it is refused.", err=True)
     return echo_paths([registered])
+
+
+def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
+    """The runs to go, how long they would take, and what could be found of its claims."""
+    from jbrep.report.views import in_text, probability, say
+    from jbrep.stats.power import BETTER_BY, EARLIER_BY, SDS
+
+    sizes = Counter(cohort for _, cohort, _ in forecast.runs)
+    to_go: dict[str, list[tuple[int, float]]] = {}
+    for cell, cohort, seconds in forecast.runs:
+        to_go.setdefault(cell.label, []).append((sizes[cohort], seconds))
+    runs: Cells = {
+        "agents": lambda item: item[0],
+        "runs": lambda item: str(len(item[1])),
+        "at once": lambda item: _range(str(size) for size, _ in sorted(item[1])),
+        "time": lambda item: _range(duration(each) for each in sorted(s for _, s in item[1])),
+    }
+    made_first: Cells = {
+        "made first": lambda cost: cost.what,
+        "to go": lambda cost: str(cost.to_go),
+        "done": lambda cost: str(cost.done),
+        "time on one core": lambda cost: duration(cost.seconds),
+    }
+    prospects: Cells = {
+        "on": lambda each: each.where,
+        "claim": lambda each: str(each.claim),
+        "units": lambda each: str(each.units),
+        "level": lambda each: probability(each.level),
+        "least p": lambda each: probability(each.least_p),
+        "power": lambda each: ", ".join(f"{100 * power:.0f} %" for power in each.power),
+        "unseen": lambda each: f"{100 * each.unseen:.0f} %",
+    }
+    parts: list[str | Table] = [Table.of("", to_go.items(), runs)] if to_go else []
+    parts.append(say("forecast", forecast, duration(forecast.seconds), duration(forecast.elapsed)))
+    parts += [Table.of("", forecast.made_first, made_first)] if forecast.made_first else []
+    if forecast.prospects:
+        count = len(planned.rules.chains) * len(planned.groups)
+        parts.append(Table.of("", forecast.prospects, prospects))
+        parts.append(say("rules", count, planned.rules.error, len(planned.seeds)))
+        parts.append(say("power", SDS, BETTER_BY, EARLIER_BY))
+    return "\n\n".join(in_text(part, width) for part in parts)
+
+
+def _range(values: Iterable[str]) -> str:
+    first, *others = dict.fromkeys(values)
+    return f"{first} to {others[-1]}" if others else first
 
 
 @click.command(epilog="Example: jbrep report runs/demo")
@@ -151,17 +201,14 @@ def report(
 
 
 def _show(made: "Report", everything: bool = False, as_json: bool = False) -> None:
-    import json
-
-    from jbrep.report.report import SUMMARY
-    from jbrep.report.statistics import results_text
+    from jbrep.report.report import results_text
 
     if not as_json:
-        echo_text(results_text(made.tables, terminal_width(), everything))
+        echo_text(results_text(made.findings, terminal_width(), everything))
     for line in made.notes:
         say(line, err=True)
     if as_json:
-        return echo_json(json.loads((made.folder / SUMMARY).read_bytes()))
+        return echo_json(made.findings.as_json())
     beside = ", ".join(path.name for path in made.paths if path != made.page)
     more = "" if everything else " --all prints every table."
     click.echo()

@@ -29,6 +29,7 @@ from jbrep.study.registration import (
     beside,
     find_committed,
 )
+from jbrep.study.results import play_references
 from jbrep.study.tables import REFERENCE_RETURNS
 from jbrep.study.work import CRASHED, Outcome, read_progress, say, work
 from jbrep.text import duration
@@ -116,7 +117,8 @@ def run_study(
 
     A study with claims is registered first: beside its file, in a commit, where git has that file.
 
-    `jbrep.study.results.write_tables` then writes what came of it.
+    At last the policies play that agents are compared with. `jbrep.study.results.write_tables` then
+    writes what came of it.
 
     Args:
         plan: the study.
@@ -143,12 +145,12 @@ def run_study(
         for cell in plan.cells:  # so that any mistake shows before the first run
             Job(plan.run(cell), plan.folder_of(cell)).clear()
         plan.write()  # not before: a study that is refused changes nothing
-        if not unfinished:
-            return 0
         progress = Progress(plan, unfinished)
-        with progress.live, closing(backend(plan, packs, workers)) as outcomes:
-            for outcome in outcomes:
-                progress.report(outcome)
+        if unfinished:
+            with progress.live, closing(backend(plan, packs, workers)) as outcomes:
+                for outcome in outcomes:
+                    progress.report(outcome)
+        play_references(plan)
     return progress.counts[CRASHED]
 
 

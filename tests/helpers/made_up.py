@@ -9,7 +9,7 @@ import pytest
 from jbrep.encoders import find, save
 from jbrep.encoders.vec_env import agent_spaces
 from jbrep.records.tables import write_rows
-from jbrep.report.figures.style import PAPER
+from jbrep.report.figures.panels import PAPER
 from jbrep.rl.agent import Spaces, make_agent, parameters
 from jbrep.rl.checkpoint import CheckpointFile, History, Snapshot
 from jbrep.rl.files import (
@@ -83,9 +83,9 @@ def returns_of(runs):
     ]
 
 
-def drawn(plot, style=PAPER):
-    with mpl.rc_context(style):
-        return plot.draw()
+def drawn(plot):
+    with mpl.rc_context(PAPER):
+        return plot.draw(plot.rows)
 
 
 def make_runs(plan, seeds):
