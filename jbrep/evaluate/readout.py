@@ -58,7 +58,7 @@ def latent_units(encoder: BaseEncoder, held_out: HeldOut) -> LatentUnits:
 def usage(e: Judged) -> tuple[Score, Score]:
     """As `latent_units` has it."""
     units = e.known.latent_units
-    return Score(len(units.dead)), Score(units.participation_ratio)
+    return Score(float(len(units.dead))), Score(units.participation_ratio)
 
 
 def quantities(task: Task, observation: ArrayLike) -> Columns:
