@@ -7,24 +7,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET
 
 from jbrep.dataset import Dataset, ScaledDataset
-from jbrep.dataset.scaled import sample
 from jbrep.dataset.settings import IMPORTED
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import as_file
 from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
+from jbrep.evaluate import control, readout
 from jbrep.evaluate.control import GoodPolicy, Needs, lost, needs
-from jbrep.evaluate.control import problems as policy_problems
 from jbrep.evaluate.evaluation import EVALUATION, KEPT, Diagnostics, Evaluation, JudgedOn
-from jbrep.evaluate.held_out import HeldOut, Rows
-from jbrep.evaluate.prediction import prediction
-from jbrep.evaluate.prediction import problems as forward_problems
-from jbrep.evaluate.readout import latent_units, nonlinear_probes, probes
-from jbrep.evaluate.readout import problem as probe_problem
+from jbrep.evaluate.held_out import HeldOut
+from jbrep.evaluate.prediction import prediction, problems
 from jbrep.evaluate.reconstruction import reconstruction
 from jbrep.evaluate.registry import Judged, measured
 from jbrep.evaluate.regression import Networks, beside, fit
@@ -35,8 +31,6 @@ from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, make_folder
 from jbrep.stats.bootstrap import RESAMPLES
 from jbrep.training.trainer import single_thread
-
-_CHECKED = 100_000  # rows at once
 
 
 def write(
@@ -57,19 +51,13 @@ def write(
         if exists(path):
             there = read_document(path, Evaluation)
             known = there.data.fingerprint, there.data.truth, there.hashes, there.policy
-            on = data.dataset.manifest.fingerprint, _fingerprint(truth)
+            on = data.dataset.manifest.fingerprint, truth.manifest.fingerprint if truth else UNSET
             if known != (*on, hashes(judged), policy.name if policy else None):
-                raise InputError(
-                    f"{path} is not an evaluation of these encoders on this data: choose another "
-                    "--out"
-                )
+                other = f"{path} is not an evaluation of these encoders on this data"
+                raise InputError(f"{other}: choose another --out")
         evaluation = diagnose(judged, data, policy, truth)
         evaluation.write(path)
     return evaluation
-
-
-def _fingerprint(truth: Dataset | None) -> str | UnsetType:
-    return truth.manifest.fingerprint if truth else UNSET
 
 
 def diagnose(
@@ -80,30 +68,19 @@ def diagnose(
 ) -> Evaluation:
     """Every diagnostic of every encoder; docs/diagnostics.md describes each.
 
-    Args:
-        encoders: by label, as `find` takes each: a file, a shipped one's name, code, an object.
-        data: to judge them on; encoders that were trained on this data set haven't seen its test
-            part.
-        policy: that does the task well; what encoders say of its actions and its value isn't known
-            without one.
-        truth: the data set that this was derived from, with features that it hides: how well they
-            can be read from a code is among the probes.
+    Of encoders by label, as `find` takes each; the other parameters are those of `jbrep.evaluate`.
     """
     data = ScaledDataset.of(data)
     held_out = HeldOut(data, truth)
     judged = {label: find(each, data.task) for label, each in encoders.items()}
-    for label, encoder in judged.items():
-        if label == FULL:
-            raise InputError(
-                f"the label {FULL} is reserved for the observation itself: choose another"
-            )
-        _check_finite(label, encoder, data, sample(data.test, 1000))
+    if FULL in judged:
+        raise InputError(f"the label {FULL} is reserved for the observation itself: choose another")
     header = EncoderHeader(kind=FULL, name=FULL, environment=data.task)
     full = Encoder(header, data.scaler, (), ())
     results, needed = _side_by_side({FULL: full, **judged}, held_out, policy)
     sha256 = hashes(judged)
     return Evaluation(
-        data=_judged_on(held_out, truth),
+        data=_judged_on(held_out),
         resamples=RESAMPLES,
         seen={label: seen(encoder, data) for label, encoder in judged.items()},
         policy=policy.name if policy else None,
@@ -136,20 +113,21 @@ def _side_by_side(
 
         def judge(label: str) -> Diagnostics:
             encoder = encoders[label]
+            _check_finite(label, encoder, held_out.data)
             is_full = encoder is full
             learnt = begun.result()[0] if is_full else networks(encoder, held_out, policy)
-            read = nonlinear_probes(encoder, held_out, learnt.probe)
+            read = readout.probes(encoder, held_out, learnt.probe)
             known = Diagnostics(
                 kind=encoder.kind,
                 latent=encoder.latent_size,
                 scores={},
                 prediction={},
                 loses=(),
-                probes=probes(encoder, held_out),
+                probes=readout.probes(encoder, held_out),
                 nonlinear_probes=read,
                 reconstruction=reconstruction(encoder, held_out) if encoder.can_decode else None,
-                latent_units=latent_units(encoder, held_out),
-                method=_of_method(encoder) if isinstance(encoder, Encoder) else {},
+                latent_units=readout.latent_units(encoder, held_out),
+                method=_method(encoder),
             )
             needed = begun.result()[1]  # waits for it
             ahead = prediction(encoder, held_out, learnt.forward, needed.reward)
@@ -158,17 +136,8 @@ def _side_by_side(
             progress.update()
             return known.replace(scores=scores)
 
-        def judge_or_blame(label: str) -> Diagnostics:
-            try:
-                return judge(label)
-            except (ValueError, np.linalg.LinAlgError):
-                data = held_out.data
-                for rows in (data.train, data.test):
-                    _check_finite(label, encoders[label], data, rows)
-                raise
-
         with Progress(total=len(encoders), unit="encoder") as progress:
-            futures = {label: pool.submit(judge_or_blame, label) for label in reversed([*encoders])}
+            futures = {label: pool.submit(judge, label) for label in reversed([*encoders])}
             try:
                 results = {label: futures[label].result() for label in encoders}
                 return results, begun.result()[1].controller
@@ -176,9 +145,10 @@ def _side_by_side(
                 pool.shutdown(cancel_futures=True)
 
 
-def _of_method(encoder: Encoder) -> dict[str, Any]:
-    kept = len(encoder.kept)
-    return {**encoder.header.metrics, **({KEPT: kept} if kept else {})}
+def _method(encoder: BaseEncoder) -> dict[str, Any]:
+    if not isinstance(encoder, Encoder):
+        return {}
+    return encoder.header.metrics | ({KEPT: len(encoder.kept)} if encoder.kept else {})
 
 
 def networks(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None = None) -> Networks:
@@ -186,18 +156,17 @@ def networks(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None 
 
     Fitted at once: one after the other they would take nearly twice as long.
     """
-    ahead = forward_problems(encoder, held_out)
-    of_policy = policy_problems(encoder, held_out, policy) if policy else {}
-    pairs = chain.from_iterable(ahead.values())
-    fitted = iter(fit([*pairs, probe_problem(encoder, held_out), *of_policy.values()]))
+    ahead, probed = problems(encoder, held_out), readout.probe_problem(encoder, held_out)
+    of_policy = control.problems(encoder, held_out, policy) if policy else {}
+    fitted = iter(fit([*chain.from_iterable(ahead.values()), probed, *of_policy.values()]))
     forward = {steps: beside(next(fitted), next(fitted)) for steps in ahead}
     return Networks(forward, next(fitted), dict(zip(of_policy, fitted, strict=True)))
 
 
-def _check_finite(label: str, encoder: BaseEncoder, data: ScaledDataset, rows: Rows) -> None:
-    for some in np.array_split(rows, -(-len(rows) // _CHECKED)):
+def _check_finite(label: str, encoder: BaseEncoder, data: ScaledDataset) -> None:
+    for rows in chain(data.observations(data.test), data.observations(data.train)):
         with np.errstate(over="ignore", invalid="ignore"):
-            latent = encoder.encode(data.dataset["observation"][some])
+            latent = encoder.encode(rows)
             back = encoder.decode(latent) if encoder.can_decode else latent
         if not np.isfinite(back).all():
             raise InputError(f"{label} gives numbers that are not finite: train it again")
@@ -217,7 +186,7 @@ def seen(encoder: BaseEncoder, data: ScaledDataset) -> Literal["no test row", "n
     return "none" if source["seed"] != manifest.settings.seed else "maybe"
 
 
-def _judged_on(held_out: HeldOut, truth: Dataset | None) -> JudgedOn:
+def _judged_on(held_out: HeldOut) -> JudgedOn:
     data, manifest = held_out.data, held_out.data.dataset.manifest
     return JudgedOn(
         task=data.task.name,
@@ -228,6 +197,6 @@ def _judged_on(held_out: HeldOut, truth: Dataset | None) -> JudgedOn:
         test_rows=len(data.test),
         test_episodes=len(held_out.numbers),
         constant_features=data.constant_features,
-        truth=_fingerprint(truth),
+        truth=held_out.shown.manifest.fingerprint if held_out.shown else UNSET,
         hidden=held_out.hidden or UNSET,
     )

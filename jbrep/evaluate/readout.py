@@ -4,10 +4,10 @@ Everything is measured on samples of rows, fewer where rows are wide: see `sampl
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
@@ -16,15 +16,19 @@ from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
 from jbrep.evaluate.prediction import changes
 from jbrep.evaluate.registry import Judged, Scalar, diagnostic
 from jbrep.evaluate.regression import Predictor, Problem, ridge
-from jbrep.evaluate.truth import Columns, quantities, quantities_and_features
+from jbrep.jitterbug.tasks import TASKS
 from jbrep.stats.bootstrap import Array
+
+Columns = dict[str, Array]
+_Truth = Callable[[Task, NDArray[Any]], Columns]
 
 _ROWS = 100_000  # at most, to fit on and to judge on
 _NEGLIGIBLE = 1e-6  # variance of standardised units, as a share of the largest
 _UNIT_ROWS = 200_000  # held-out rows
 _DEAD = 0.01  # standard deviation, as a share of the most variable unit's
 _STILL = 1e-6  # standard deviation that rounding alone can cause
-_UNKNOWN = Score(None)
+_ROTATION = ("orientation_w", "orientation_x", "orientation_y", "orientation_z")
+_NEEDED = {*_ROTATION, "velocity_x", "velocity_y", "motor_angle"}  # features, for the quantities
 
 
 def latent_units(encoder: BaseEncoder, held_out: HeldOut) -> LatentUnits:
@@ -54,27 +58,103 @@ def latent_units(encoder: BaseEncoder, held_out: HeldOut) -> LatentUnits:
 def usage(e: Judged) -> tuple[Score, Score]:
     """As `latent_units` has it."""
     units = e.known.latent_units
-    return Score(len(units.dead)), Score(units.participation_ratio)
+    return Score(float(len(units.dead))), Score(units.participation_ratio)
 
 
-def probes(encoder: BaseEncoder, held_out: HeldOut) -> Scores:
-    """R^2 of a ridge regression of each quantity on the latent, fitted on training rows.
+def quantities(task: Task, observation: ArrayLike) -> Columns:
+    """What a controller needs to know from observations (n, d) in physical units.
 
-    The cosine and sine of an angle count together. At most 100,000 rows are fitted to, and as many
-    judged; of more than 83 features, fewer.
+    An angle is its cosine and sine, (n, 2); the rest is (n, 1). Of the Jitterbug: the heading of
+    its face in the world, its uprightness (cosine of the tilt), its forward speed [m/s], the
+    motor's phase, and, if the task has them, the angle to the target's yaw and the bearing of the
+    target's position from the face, counter-clockwise. Of any other robot: every feature; it is an
+    angle if its unit is rad and it is bounded to one turn.
     """
-    fitted_to = _problem(encoder, held_out, quantities)
-    return _probes(encoder, held_out, quantities, ridge(fitted_to.values, fitted_to.wanted))
+    is_known = task.name in TASKS and {*task.feature_names} >= _NEEDED and not task.offset.any()
+    return _jitterbug(_features(task, observation)) if is_known else every(task, observation)
 
 
-def problem(encoder: BaseEncoder, held_out: HeldOut) -> Problem:
-    """Each quantity and every feature, from the latent."""
-    return _problem(encoder, held_out, quantities_and_features)
+def quantities_and_features(task: Task, observation: ArrayLike) -> Columns:
+    """The quantities, then the features that aren't among them; all angles as cosine and sine."""
+    known, features = quantities(task, observation), every(task, observation)
+    return known | {name: features[name] for name in features if name not in known}
 
 
-def nonlinear_probes(encoder: BaseEncoder, held_out: HeldOut, predict: Predictor) -> Scores:
-    """R^2 as `probes`, by what was fitted to `problem`."""
-    return _probes(encoder, held_out, quantities_and_features, predict)
+def every(task: Task, observation: ArrayLike) -> Columns:
+    """All features, (n, k) by name: angles as cosine and sine."""
+    angles = {feature.name for feature in task.features if feature.is_full_turn}
+    return {
+        name: _on_circle(column) if name in angles else column[:, None]
+        for name, column in _features(task, observation).items()
+    }
+
+
+def _features(task: Task, observation: ArrayLike) -> Columns:
+    columns = np.asarray(observation, np.float64).T
+    return dict(zip(task.feature_names, columns, strict=True))
+
+
+def _jitterbug(f: Columns) -> Columns:
+    w, x, y, z = (f[name] for name in _ROTATION)
+    face = _direction(2 * (w * z - x * y), 2 * (x * x + z * z) - 1)  # the robot's -Y axis
+    speed = face[:, 0] * f["velocity_x"] + face[:, 1] * f["velocity_y"]
+    columns = {
+        "heading": face,
+        "uprightness": (1 - 2 * (x * x + y * y))[:, None],
+        "forward_speed": speed[:, None],
+        "motor_phase": _on_circle(f["motor_angle"]),
+    }
+    if "angle_to_target" in f:
+        columns["angle_to_target"] = _on_circle(f["angle_to_target"])
+    if "target_x" in f:
+        columns["bearing_of_target"] = _direction(-f["target_y"], f["target_x"])
+    return columns
+
+
+def _on_circle(angle: Array) -> Array:
+    """Cosine and sine, (n, 2)."""
+    return np.stack((np.cos(angle), np.sin(angle)), axis=1)
+
+
+def _direction(x: Array, y: Array) -> Array:
+    """Unit vectors along (x, y), (n, 2); zero vectors stay zero."""
+    length = np.maximum(np.hypot(x, y), 1e-12)
+    return np.stack((x / length, y / length), axis=1)
+
+
+def probe_problem(
+    encoder: BaseEncoder, held_out: HeldOut, truth: _Truth = quantities_and_features
+) -> Problem:
+    """What is true, by default each quantity and every feature, from the latent."""
+    seen, true = _true(held_out, held_out.data.train, truth)[1:]
+    return Problem(encoder.encode(seen), np.hstack(list(true.values())))
+
+
+def probes(encoder: BaseEncoder, held_out: HeldOut, predict: Predictor | None = None) -> Scores:
+    """R^2 of each quantity by a ridge regression on the latent, fitted on training rows.
+
+    By what was fitted to `probe_problem`, of every feature, too. The cosine and sine of an angle
+    count together. At most 100,000 rows are fitted to, and as many judged; of more than 83
+    features, fewer.
+    """
+    truth = quantities_and_features if predict else quantities
+    predict = predict or ridge(*probe_problem(encoder, held_out, truth)[:2])
+    rows, unseen, true = _true(held_out, held_out.data.test, truth)
+    widths = [values.shape[1] for values in true.values()]
+    predicted, wanted = predict(encoder.encode(unseen)), np.hstack(list(true.values()))
+    return dict(zip(true, explained(predicted, wanted, rows, held_out.sums, widths), strict=True))
+
+
+def _true(held_out: HeldOut, rows: Rows, truth: _Truth) -> tuple[Rows, NDArray[Any], Columns]:
+    """A sample of rows, the observations there, and what is true: what isn't seen, too."""
+    data = held_out.data
+    chosen = sample_rows(rows, _ROWS, data.task.size)
+    seen = data.dataset["observation"][chosen]
+    true = truth(data.task, seen)
+    if shown := held_out.shown:
+        known = every(shown.task, shown["observation"][chosen])
+        true |= {name: known[name] for name in held_out.hidden}
+    return chosen, seen, true
 
 
 @diagnostic(
@@ -89,39 +169,6 @@ def mean_probes(e: Judged) -> tuple[Score, Score]:
 def _mean(scores: Scores) -> Score:
     known = [score.value for score in scores.values() if score.value is not None]
     return Score(sum(known) / len(known) if known else None)
-
-
-_Truth = Callable[[Task, NDArray[Any]], Columns]
-
-
-def _problem(encoder: BaseEncoder, held_out: HeldOut, truth: _Truth) -> Problem:
-    seen, true = _true(held_out, held_out.data.train, truth)[1:]
-    return Problem(encoder.encode(seen), np.hstack(list(true.values())))
-
-
-def _probes(encoder: BaseEncoder, held_out: HeldOut, truth: _Truth, predict: Predictor) -> Scores:
-    rows, unseen, true = _true(held_out, held_out.data.test, truth)
-    widths = [values.shape[1] for values in true.values()]
-    predicted, wanted = predict(encoder.encode(unseen)), np.hstack(list(true.values()))
-    return dict(zip(true, explained(predicted, wanted, rows, held_out, widths), strict=True))
-
-
-def _true(held_out: HeldOut, rows: Rows, truth: _Truth) -> tuple[Rows, NDArray[Any], Columns]:
-    """A sample of rows, the observations there, and what is true: what isn't seen, too."""
-    data = held_out.data
-    chosen = sample_rows(rows, _ROWS, data.task.size)
-    seen = data.dataset["observation"][chosen]
-    return chosen, seen, {**truth(data.task, seen), **held_out.truth(chosen)}
-
-
-class _Steps(NamedTuple):
-    """Some rows that have a next one, with what leads to it."""
-
-    rows: Rows  # (n,)
-    latent: NDArray[Any]  # (n, l)
-    action: NDArray[Any]  # (n, k)
-    next_latent: NDArray[Any]  # (n, l)
-    change: NDArray[Any]  # of the observation to the next one, (n, d)
 
 
 @diagnostic(
@@ -140,35 +187,33 @@ def dynamics(e: Judged) -> tuple[Score, Score, Score]:
     Fitted to at most 100,000 training rows and judged on as many held-out ones, fewer of more than
     83 features; the last row of an episode is left out. None where fewer than two are left.
     """
-    encoder, held_out, data = e.encoder, e.held_out, e.held_out.data
-    seen, unseen = (_steps(encoder, held_out, rows) for rows in (data.train, data.test))
-    if min(len(seen.rows), len(unseen.rows)) < 2:
-        return _UNKNOWN, _UNKNOWN, _UNKNOWN
-    whitened = _whitening(seen.latent)
-    spread = seen.change.std(axis=0, dtype=np.float64)
+    data, encode = e.held_out.data, e.encoder.encode
+    width = max(data.task.size, e.encoder.latent_size)
+    fitted_to, rows = (
+        e.held_out.followed(sample_rows(part, _ROWS, width)) for part in (data.train, data.test)
+    )
+    if min(len(fitted_to), len(rows)) < 2:
+        return Score(None), Score(None), Score(None)
+    observation, action = data.dataset["observation"], data.dataset["action"]
+    whitened = _whitening(encode(observation[fitted_to]))
+    change = changes(data.task, observation, fitted_to, 1)
+    spread = change.std(axis=0, dtype=np.float64)
     spread[spread == 0] = 1
-    before, now = (np.hstack((whitened(s.latent), s.action)) for s in (seen, unseen))
-    after, then = whitened(seen.next_latent), whitened(unseen.next_latent)
+    before, now = (
+        np.hstack((whitened(encode(observation[r])), action[r])) for r in (fitted_to, rows)
+    )
+    after, then = (whitened(encode(observation[r + 1])) for r in (fitted_to, rows))
     width = after.shape[1]
-    fitted = ridge(before, np.hstack((after, seen.change / spread)))(now)
+    predicted = ridge(before, np.hstack((after, change / spread)))(now)
 
     def judged(predicted: Array, true: Array) -> Score:
-        return explained(predicted, true, unseen.rows, held_out)[0]
+        return explained(predicted, true, rows, e.held_out.sums)[0]
 
     return (
-        judged(fitted[:, :width], then),
+        judged(predicted[:, :width], then),
         judged(now[:, :width], then),
-        judged(fitted[:, width:], unseen.change / spread),
+        judged(predicted[:, width:], changes(data.task, observation, rows, 1) / spread),
     )
-
-
-def _steps(encoder: BaseEncoder, held_out: HeldOut, rows: Rows) -> _Steps:
-    dataset = held_out.data.dataset
-    width = max(held_out.data.task.size, encoder.latent_size)
-    chosen = held_out.followed(sample_rows(rows, _ROWS, width))
-    latent, next_latent = (encoder.encode(dataset["observation"][r]) for r in (chosen, chosen + 1))
-    change = changes(held_out.data.task, dataset["observation"], chosen, 1)
-    return _Steps(chosen, latent, dataset["action"][chosen], next_latent, change)
 
 
 def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:

@@ -21,37 +21,22 @@ if TYPE_CHECKING:
 
 
 class Judged(NamedTuple):
-    """An encoder on held-out episodes, with what all diagnostics of it share.
-
-    Attributes:
-        encoder: that is judged.
-        held_out: the episodes.
-        policy: that does the task well, if one is known.
-        learnt: regressions from the latent.
-        known: what is known of it already: prediction, probes, reconstruction, units.
-    """
+    """An encoder on held-out episodes, with what all diagnostics of it share."""
 
     encoder: BaseEncoder
     held_out: "HeldOut"
-    policy: "GoodPolicy | None"
-    learnt: "Networks"
-    known: Diagnostics
+    policy: "GoodPolicy | None"  # that does the task well, if one is known
+    learnt: "Networks"  # regressions from the latent
+    known: Diagnostics  # prediction, probes, reconstruction and units; no scores yet
 
 
 class Scalar(NamedTuple):
-    """A named number of an encoder's diagnostics: a column of diagnostics.csv.
-
-    Attributes:
-        name: of the column.
-        words: what it is, in a few words.
-        better: 1 if higher is better, -1 if lower is.
-        is_first: whether it is among the first that a user sees.
-    """
+    """A named number of an encoder's diagnostics: a column of diagnostics.csv."""
 
     name: str
-    words: str
-    better: int = 1
-    is_first: bool = False
+    words: str  # what it is, in a few words
+    better: int = 1  # 1 if higher is better, -1 if lower is
+    is_first: bool = False  # whether it is among the first that a user sees
 
     def read(self, known: Diagnostics) -> Score | None:
         """Its score, if an evaluation has it."""

@@ -63,13 +63,12 @@ def _value(cell: str) -> float | None:
 
 def by_label(rows: Iterable[Diagnosed]) -> dict[tuple[str, str], dict[str, float | None]]:
     """The values of each task and representation: the mean over its encoders that have one."""
-    groups: dict[tuple[str, str], list[Values]] = {}
+    groups: dict[tuple[str, str], dict[str, list[float]]] = {}
     for row in rows:
-        groups.setdefault((row.task, row.representation), []).append(row.values)
-    return {label: _means(values) for label, values in groups.items()}
-
-
-def _means(several: Sequence[Values]) -> dict[str, float | None]:
-    names = dict.fromkeys(name for values in several for name in values)
-    known = {name: [v for each in several if (v := each.get(name)) is not None] for name in names}
-    return {name: math.fsum(each) / len(each) if each else None for name, each in known.items()}
+        known = groups.setdefault((row.task, row.representation), {})
+        for name, value in row.values.items():
+            known.setdefault(name, []).extend([] if value is None else [value])
+    return {
+        label: {name: math.fsum(each) / len(each) if each else None for name, each in known.items()}
+        for label, known in groups.items()
+    }
