@@ -8,6 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from jbrep.report.figures.curves import every_run
+from jbrep.report.figures.diagnostics import _free
+from jbrep.report.figures.differences import difference_plot
+from jbrep.report.figures.methods import method_plots, timescales
+from jbrep.report.figures.plot import Drawing
+from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, family, styles, with_runs
 from judged import NOTHING, diagnostics, evaluation, prediction
 from made_up import drawn, label_of, returns_of
 from matplotlib.text import Text
@@ -26,12 +32,6 @@ from jbrep.evaluate.evaluation import (
 from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, observe
 from jbrep.records.document import read_document
 from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, write
-from jbrep.report.figures.curves import every_run
-from jbrep.report.figures.diagnostics import _free
-from jbrep.report.figures.differences import difference_plot
-from jbrep.report.figures.methods import method_plots, timescales
-from jbrep.report.figures.plot import Drawing
-from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, family, styles, with_runs
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
@@ -419,8 +419,7 @@ def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
     encoders = {name: whole.encoders[name] for name in ("full", "dae-12", "dae-8", "pca-8")}
     found = {plot.name: plot for plot in encoder_plots(whole.replace(encoders=encoders))}
     assert list(found) == [
-        *("prediction_by_feature", "prediction_by_horizon"),
-        *("error_by_feature", "error_by_latent", "error_by_corruption", "latent_correlation"),
+        *("prediction_by_feature", "prediction_by_horizon", "error_by_feature", "error_by_latent"),
     ]
     error = encoders["dae-8"].reconstruction.mse
     (row,) = [row for row in found["error_by_latent"].rows if row[0] == "dae-8"]
@@ -429,10 +428,7 @@ def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
     assert any(error.value in container.lines[0].get_ydata() for container in axes.containers)
     assert axes.lines[-1].get_label() == "PCA"
     assert axes.lines[-1].get_marker() == "o"  # as a line, one size alone couldn't be seen
-    matrix = drawn(found["latent_correlation"]).axes[0].images[0].get_array()
-    expected = encoders["dae-12"].latent_units.correlation
-    np.testing.assert_array_equal(matrix, np.array(expected, float))
-    assert len(write(found.values(), tmp_path)) == 6
+    assert len(write(found.values(), tmp_path)) == 4
 
 
 def test_of_a_wide_robot_the_worst_features_are_shown():
@@ -443,12 +439,12 @@ def test_of_a_wide_robot_the_worst_features_are_shown():
         for i, each in enumerate(r2)
     ]
     loses = {"mse": NOTHING, "pca_mse": NOTHING, "ratio_to_pca": None, "features": features}
-    lost = Reconstruction(**loses, quantiles={}, worst_episodes=[])
+    lost = Reconstruction(**loses)
     encoders = {
-        name: diagnostics(348, kind=kind, reconstruction=lost, corruption=[])
+        name: diagnostics(348, kind=kind, reconstruction=lost)
         for name, kind in (("dae-348", "dae"), ("raw", "full"))
     }
-    by_feature, correlations = encoder_plots(evaluation(encoders, "Humanoid-v5"))
+    (by_feature,) = encoder_plots(evaluation(encoders, "Humanoid-v5"))
     assert len(by_feature.rows) == 2 * 348
     assert "Of 348 features the 40 worst are shown; all are in the table." in by_feature.caption
     figure = drawn(by_feature)
@@ -456,9 +452,6 @@ def test_of_a_wide_robot_the_worst_features_are_shown():
     assert names == [f"obs_{i}" for i in range(307, 347)]
     assert "the 40 worst of 348 features" in figure.get_suptitle()
     assert figure.get_figheight() < 8
-    for axes in drawn(correlations).axes[:2]:
-        assert len(axes.get_xticks()) < 20
-        assert not any("obs" in label.get_text() for label in axes.get_xticklabels())
 
 
 def test_diagnostics_stand_against_final_returns(analysis, returns):
@@ -585,7 +578,7 @@ def of_methods():
 
 def test_methods_and_predictions_have_figures(of_methods):
     assert list(of_methods) == [
-        *("prediction_by_feature", "prediction_by_horizon", "latent_correlation"),
+        *("prediction_by_feature", "prediction_by_horizon"),
         *("spectrum", "timescales", "loss_by_horizon", "losses"),
     ]
 

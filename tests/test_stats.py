@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from jbrep.report.returns import return_form
+from jbrep.report.statistics import statistics_text
 from scipy import optimize, stats
 
 from jbrep.errors import InputError
-from jbrep.report.returns import return_form
-from jbrep.report.statistics import statistics_text
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.aggregates import aggregates
 from jbrep.stats.analysis import to_plain

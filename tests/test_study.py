@@ -26,6 +26,7 @@ from command import (
     wait_for_the_end_of,
     workers_of,
 )
+from jbrep.report.statistics import results_text
 from small import adopt, forge
 
 from jbrep.dataset import Dataset
@@ -35,7 +36,6 @@ from jbrep.errors import DamageError, InputError
 from jbrep.play.behaviour import observe
 from jbrep.play.sources import find_player, find_untrained
 from jbrep.report.report import statistics
-from jbrep.report.statistics import results_text
 from jbrep.report.tables import read_tables
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, RUN, read_run

@@ -333,7 +333,7 @@ def policies(as_json: bool) -> None:
     return tell("falling: the preset wide, but with a learning rate that falls to 0")
 
 
-@click.command(epilog="Example: jbrep behaviour runs/full runs/dae-4 --out behaviour")
+@click.command(epilog="Example: jbrep behaviour runs/full runs/dae-4")
 @click.argument("policies", nargs=-1, required=True)
 @task_option
 @click.option(
@@ -342,22 +342,19 @@ def policies(as_json: bool) -> None:
 @click.option(
     "--target-yaw", default=45.0, show_default=True, help="Where every target points [degrees]."
 )
-@click.option("--out", required=True, type=PATH, help="A folder.")
 @environment_options
-def behaviour(
-    policies: tuple[str, ...], episodes: int, target_yaw: float, out: Path, **options: Any
-) -> None:
-    """Draw how policies turn the motor and where they go.
+def behaviour(policies: tuple[str, ...], episodes: int, target_yaw: float, **options: Any) -> None:
+    """Show how policies turn the motor and where they go.
 
     For the Jitterbug's tasks alone. A policy is the folder of a run, shown before and after
     training; a folder with several runs, which count as one; or a name, such as heuristic. All play
-    the same episodes.
+    the same episodes. examples/behaviour draws both.
     """
     import numpy as np
 
-    from jbrep.play.behaviour import FAST, FIGURES, SPEEDS, fast_shares, observe
+    from jbrep.play.behaviour import FAST, fast_shares, observe
     from jbrep.play.sources import check_source
-    from jbrep.records.storage import exists, make_folder
+    from jbrep.records.storage import exists
 
     if not np.isfinite(target_yaw):
         raise InputError(f"--target-yaw is {target_yaw}: it must be a number of degrees")
@@ -365,11 +362,8 @@ def behaviour(
     for policy in policies:
         if not exists(policy):
             check_source(policy)
-    make_folder(out, [f"{name}.png" for name in FIGURES])
-    from jbrep.report.figures import behaviour_plots, write  # imports torch
-
     with stoppable("the same command starts again"):
-        shared_task, behaviours = observe(policies, task, episodes, yaw)
+        _, behaviours = observe(policies, task, episodes, yaw)
     header = (
         *("policy", "return [10, 90 %]", f"motor < -{FAST:g} rad/s", f"> {FAST:g} rad/s"),
         "mean x, y [m]",
@@ -384,4 +378,3 @@ def behaviour(
         for each in behaviours
     ]
     echo_text(table(header, rows, terminal_width()))
-    echo_paths(write(behaviour_plots(shared_task.name, behaviours, SPEEDS, yaw), out))

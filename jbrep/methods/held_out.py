@@ -1,7 +1,6 @@
 """How well encoders reconstruct held-out rows, and how they compare with PCA."""
 
 from collections.abc import Container
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,7 @@ def held_out_error(
 
 
 def lost(
-    encoder: BaseEncoder, rows: NDArray[np.float32], data: ScaledDataset, given: Any = None
+    encoder: BaseEncoder, rows: NDArray[np.float32], data: ScaledDataset
 ) -> NDArray[np.float32]:
     """What a reconstruction of rows (n, d) lacks, in half widths of the features in the data.
 
@@ -47,9 +46,8 @@ def lost(
         encoder: that can decode.
         rows: in physical units.
         data: whose scaling counts.
-        given: rows that are encoded in their place, such as corrupted ones.
     """
-    back = encoder.decode(encoder.encode(rows if given is None else given))
+    back = encoder.decode(encoder.encode(rows))
     if isinstance(encoder, Encoder) and (coordinates := encoder.scaler.coordinates):
         rows = coordinates.inverse(coordinates.forward(rows))
     return (encoder.comparable(back, rows) - rows) / data.scaler.half_width

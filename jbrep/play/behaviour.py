@@ -19,7 +19,6 @@ from jbrep.rl.files import FINISHED, read_run, runs_below
 from jbrep.text import counted
 
 SPEEDS = np.linspace(-180, 180, 73)  # edges of the bins of the motor's velocity [rad/s]
-FIGURES = ("motor_velocity", "positions")  # that show it, by name
 FAST = 30.0  # of the motor, either way [rad/s]
 _CELL = 0.02  # edge of a cell of the floor [m]
 
