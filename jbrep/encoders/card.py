@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import Encoder
-from jbrep.encoders.layers import Layer
+from jbrep.encoders.encoder import Encoder, Layers
 from jbrep.envs.task import Feature
 from jbrep.text import facts, table
 
@@ -84,8 +83,8 @@ def _read(encoder: Encoder) -> tuple[Feature, ...]:
     return encoder.scaler.features(encoder.task)
 
 
-def _layers(layers: tuple[Layer, ...]) -> list[dict[str, Any]]:
-    return [{"units": len(layer.bias), "activation": layer.activation} for layer in layers]
+def _layers(layers: Layers) -> list[dict[str, Any]]:
+    return [{"units": layer.units, "activation": layer.activation} for layer in layers]
 
 
 def _shape(size: int, layers: list[dict[str, Any]]) -> str:

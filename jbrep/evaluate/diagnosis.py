@@ -14,7 +14,6 @@ from jbrep.dataset.scaled import sample
 from jbrep.dataset.settings import IMPORTED
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import as_file
 from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
 from jbrep.evaluate import control, prediction, readout
@@ -46,7 +45,7 @@ def write(
     judged = {label: find(each, data.task) for label, each in encoders.items()}
     make_folder(folder, (EVALUATION,))
     with exclusive(path, beside=True):
-        before = _before(path, data, hashes(judged), policy, truth)
+        before = _before(path, data, _hashes(judged), policy, truth)
         evaluation = diagnose(judged, data, policy, truth)
         if before:
             evaluation = evaluation.replace(worth=before.worth)
@@ -111,7 +110,7 @@ def diagnose(
     header = EncoderHeader(kind=FULL, name=FULL, environment=data.task)
     full = Encoder(header, data.scaler, (), ())
     results, needed = _side_by_side({FULL: full, **judged}, held_out, policy)
-    sha256 = hashes(judged)
+    sha256 = _hashes(judged)
     return Evaluation(
         data=_judged_on(held_out, truth),
         resamples=RESAMPLES,
@@ -122,10 +121,8 @@ def diagnose(
     )
 
 
-def hashes(encoders: Mapping[str, BaseEncoder]) -> dict[str, str]:
-    """SHA-256 of encoders by label; of a module, that of the file that a run keeps of it."""
-    with single_thread():
-        return {label: as_file(encoder).fingerprint for label, encoder in encoders.items()}
+def _hashes(encoders: Mapping[str, BaseEncoder]) -> dict[str, str]:
+    return {label: encoder.fingerprint for label, encoder in encoders.items()}
 
 
 def _side_by_side(

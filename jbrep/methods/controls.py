@@ -7,8 +7,9 @@ from msgspec import Meta
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import FULL
+from jbrep.encoders.layers import dense
 from jbrep.errors import InputError
-from jbrep.methods.linear import dense, linear_code
+from jbrep.methods.linear import linear_code
 from jbrep.training.method import ClosedForm, Coded, Made, Network
 from jbrep.training.network import get_architecture, layers, stacks
 from jbrep.training.settings import Architecture, Names, On, Scaling, Seed

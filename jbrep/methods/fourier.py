@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import Meta
 
 from jbrep.dataset import ScaledDataset
-from jbrep.methods.linear import dense
+from jbrep.encoders.layers import dense
 from jbrep.training.method import ClosedForm, Coded, Made
 from jbrep.training.settings import Seed
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.encoders.layers import Layer
+from jbrep.encoders.layers import dense
 from jbrep.envs.task import Array
 from jbrep.errors import InputError
 from jbrep.training.method import ClosedForm, Coded, Made
@@ -51,12 +51,6 @@ def linear_denoiser(latent: int, noise: float, moments: Moments) -> tuple[Layers
     directions = vectors[:, ::-1][:, :latent]
     weight = directions.T @ ridge
     return (dense(weight, -weight @ mean),), (dense(directions, mean),)
-
-
-def dense(weight: Array, bias: Array, activation: str = "linear") -> Layer:
-    """A layer from float64."""
-    single = np.ascontiguousarray(weight, dtype=np.float32)
-    return Layer(single, bias.astype(np.float32), activation)
 
 
 def signed(weight: Array) -> Array:

@@ -9,10 +9,9 @@ from msgspec import Meta
 from torch import Tensor, nn
 
 from jbrep.dataset import ScaledDataset
-from jbrep.encoders.layers import Layer
+from jbrep.encoders.layers import Layer, dense
 from jbrep.envs.task import Array
 from jbrep.errors import InputError
-from jbrep.methods.linear import dense
 from jbrep.training.method import Learned
 from jbrep.training.network import seeded
 from jbrep.training.objective import Layers, Objective

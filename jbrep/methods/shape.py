@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.encoders.layers import Layer, run
+from jbrep.encoders.layers import Layer, dense, run
 from jbrep.envs.task import Array
-from jbrep.methods.linear import DEVIATION, dense, inverse_root
+from jbrep.methods.linear import DEVIATION, inverse_root
 from jbrep.training.method import Made
 from jbrep.training.objective import Layers
 
