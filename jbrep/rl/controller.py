@@ -209,7 +209,11 @@ def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[La
     activation = str(shape.policy_kwargs.get("activation_fn")).replace("_", "-")
     choose(activation, ACTIVATIONS, "activation")
     parts = [part for prefix in _HIDDEN for part in _numbered(prefix, weights)]
-    parts += [without(f"{name}.", weights) for name in _LAST if f"{name}.weight" in weights]
+    parts += [
+        {"weight": weights[f"{name}.weight"], "bias": weights[f"{name}.bias"]}
+        for name in _LAST
+        if f"{name}.weight" in weights
+    ]
     layers: list[Layer] = []
     factor, shift = np.ones(inputs), np.zeros(inputs)  # applied to what the next layer takes
     for tensors in parts:
