@@ -17,16 +17,16 @@ from jbrep.encoders.file import SUFFIX
 from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader
 from jbrep.encoders.names import check_name
 from jbrep.errors import InputError, differences
-from jbrep.methods.held_out import held_out_error
-from jbrep.methods.purpose import purpose
-from jbrep.methods.registry import get_method, name_of
+from jbrep.methods.held_out import held_out_error, ratio_to_pca
+from jbrep.methods.linear import PCA
+from jbrep.methods.registry import METHODS, get_method, name_of
 from jbrep.methods.shape import complete
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, inside, make_folder
 from jbrep.training import checkpoint
-from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method
+from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method, Reconstructing
 from jbrep.training.network import check_layers
 from jbrep.training.trainer import (
     Epoch,
@@ -37,6 +37,9 @@ from jbrep.training.trainer import (
     single_thread,
 )
 from jbrep.training.windows import Windows, count_windows, watched_windows
+
+_ALIKE = 0.05  # of PCA's error, within which another is as good
+_POOR = 1.5  # times PCA's error, from which a trained autoencoder deserves a warning
 
 
 class Fitted(NamedTuple):
@@ -275,3 +278,34 @@ def _with_progress(trainer: Trainer, name: str) -> Iterator[Epoch]:
             progress.set_postfix(train=f"{epoch.train_loss:.5f}", test=f"{epoch.test_loss:.5f}")
             progress.update()
             yield epoch
+
+
+def purpose(encoder: Encoder, data: ScaledDataset) -> str:
+    """How good an encoder is at what its kind is for; empty of one that is for nothing of its own.
+
+    Args:
+        encoder: made of these data by a method.
+        data: to reconstruct, where that is what it is for.
+    """
+    method = METHODS[encoder.kind]
+    if not issubclass(method, Reconstructing | PCA):
+        return method.achieved(encoder.header.metrics, encoder.latent_size - len(encoder.kept))
+    error = f"{encoder.header.metrics[HELD_OUT_MSE]:.5f}, of features scaled to [-1, 1]"
+    ratio = ratio_to_pca(encoder, data)
+    if method is PCA or ratio is None:
+        return f"reconstructs held-out states with a mean squared error of {error}"
+    told = (
+        f"reconstructs held-out states {_beside(ratio)} PCA: {ratio:.2f} times its error ({error})"
+    )
+    if ratio <= _POOR:
+        return told
+    return (
+        f"{told}; train for more --epochs, on more data, or with another --learning-rate or "
+        "--batch-size"
+    )
+
+
+def _beside(ratio: float) -> str:
+    if abs(ratio - 1) < _ALIKE:
+        return "as well as"
+    return "better than" if ratio < 1 else "worse than"

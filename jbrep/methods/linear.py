@@ -1,6 +1,6 @@
 """Linear codes: principal components, and what every method that finds directions needs."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -69,19 +69,15 @@ def inverse_root(covariance: Array, what: str) -> Array:
     return (vectors / np.sqrt(variances)) @ vectors.T
 
 
-def direction_code(directions: Array, moments: Moments, spectrum: Array, **metrics: Any) -> Made:
-    """The linear code of some directions (l, d), each unit with standard deviation 1/3.
+def direction_code(directions: Array, moments: Moments, spectrum: Array) -> Made:
+    """The linear code of directions (l, d) of any length, each unit with standard deviation 1/3.
 
-    Args:
-        directions: of the code, of any length.
-        moments: of the rows.
-        spectrum: what the method says of all directions, the largest first.
-        metrics: more of what it says.
+    `spectrum` is what the method says of all directions, the largest first.
     """
     mean, covariance = moments
     variances = np.einsum("li,ij,lj->l", directions, covariance, directions)
     weight = DEVIATION * signed(directions / np.sqrt(variances)[:, None])
-    return Made((dense(weight, -weight @ mean),), None, {"spectrum": spectrum.tolist(), **metrics})
+    return Made((dense(weight, -weight @ mean),), None, {"spectrum": spectrum.tolist()})
 
 
 def whitening(

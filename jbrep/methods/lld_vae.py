@@ -8,7 +8,6 @@ one episode, with the action between them.
 import math
 from typing import ClassVar
 
-from msgspec import field
 from torch import Tensor
 
 from jbrep.dataset import ScaledDataset
@@ -22,14 +21,7 @@ from jbrep.methods.vae import (
 )
 from jbrep.training.network import layers, stack
 from jbrep.training.objective import Layers, Objective
-from jbrep.training.settings import (
-    BatchSize,
-    Epochs,
-    FeatureWeights,
-    LearningRate,
-    Seed,
-    TransitionWeight,
-)
+from jbrep.training.settings import BatchSize, TransitionWeight
 from jbrep.training.windows import Windows
 
 _LEAST, _MOST = math.log(0.01), math.log(10)  # log standard deviation of a reconstruction
@@ -43,11 +35,7 @@ class LldVae(Variational, frozen=True, kw_only=True):
 
     beta: Beta = 1.0
     transition: TransitionWeight = 0.1
-    epochs: Epochs = 12
     batch_size: BatchSize = 1000
-    learning_rate: LearningRate = 1e-3
-    seed: Seed = 0
-    weights: FeatureWeights = field(default_factory=dict)
 
     def objective(self, data: ScaledDataset) -> Objective:
         return LldVaeObjective(self, data)
@@ -73,7 +61,6 @@ class LldVaeObjective(VariationalObjective):
         self.transition = stack((count, count, count * (3 + data.task.action_size)), "linear")
 
     def inputs(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """As `Windows.steps`."""
         return windows.steps(numbers)
 
     def step(self, code: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:

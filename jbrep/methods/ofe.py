@@ -15,8 +15,7 @@ from jbrep.errors import InputError
 from jbrep.training.method import Learned
 from jbrep.training.network import seeded
 from jbrep.training.objective import Layers, Objective
-from jbrep.training.settings import BatchSize, Epochs, LearningRate, Seed
-from jbrep.training.windows import Windows
+from jbrep.training.settings import LearningRate
 
 
 class OFE(Learned, frozen=True, kw_only=True):
@@ -28,10 +27,7 @@ class OFE(Learned, frozen=True, kw_only=True):
     blocks: Annotated[
         int, Meta(ge=1, le=32, description="Layers, each of which sees all that come before.")
     ] = 4
-    epochs: Epochs = 12
-    batch_size: BatchSize = None
     learning_rate: LearningRate = 1e-3
-    seed: Seed = 0
 
     def check_data(self, data: ScaledDataset) -> None:
         super().check_data(data)
@@ -138,10 +134,6 @@ class OFEObjective(Objective):
             self.beside_action = DenseBlocks(inputs, widths)
             self.next_row = nn.Linear(inputs + sum(widths), data.size)
 
-    def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """As `Windows.steps`."""
-        return windows.steps(numbers)
-
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
         now, actions, after = batch
         known = self.beside_action(torch.cat((self.encoder(now), actions), 1))
@@ -149,7 +141,6 @@ class OFEObjective(Objective):
         return error
 
     def layers(self) -> tuple[Layers, Layers | None]:
-        """As for `Objective`; the decoder takes the row out of the code."""
         encoder = self.blocks.layers()
         rows = np.eye(self._size, len(encoder[-1].bias))
         return encoder, (dense(rows, np.zeros(self._size)),)

@@ -27,7 +27,6 @@ class AvgL1Norm(nn.Module):
 
 _MODULES = {"relu": nn.ReLU, "tanh": nn.Tanh, AVG_L1_NORM: AvgL1Norm}
 _SIZES = re.compile(r"[1-9][0-9]{0,8}([x,][1-9][0-9]{0,8})*")
-_BYTES = 4  # of a number in float32
 HIDDEN = 64  # units of each of a predictor's two hidden layers
 _NAMES = {module: name for name, module in _MODULES.items()}
 
@@ -70,29 +69,11 @@ def get_architecture(name: str) -> Architecture:
     return replace(ARCHITECTURES["deep"], name="x".join(map(str, hidden)), hidden=hidden)
 
 
-def check_size(name: str, size: int, latent: int) -> None:
-    """Make sure that a network from `size` features to `latent` units fits an encoder's file.
-
-    Args:
-        name: of its architecture.
-        size: features.
-        latent: units.
-    """
-    architecture = get_architecture(name)
-    widths = (size, *architecture.hidden, latent)
-    needed = 2 * _BYTES * sum(before * after for before, after in pairwise(widths))
-    if needed > MAX_BYTES:
-        raise InputError(
-            f"architecture {architecture.name} has weights of {needed:,} bytes with {size} "
-            f"features: an encoder's file has at most {MAX_BYTES:,}; choose smaller sizes"
-        )
-
-
 def check_layers(*parts: Sequence[Layer] | None) -> None:
     """Make sure that layers fit an encoder's file."""
     every = [layer for part in parts for layer in part or ()]
-    needed = _BYTES * sum(layer.weight.size + layer.bias.size for layer in every)
-    widest = max((len(layer.bias) for layer in every), default=0)
+    needed = sum(layer.weight.nbytes + layer.bias.nbytes for layer in every)
+    widest = max((layer.units for layer in every), default=0)
     if needed > MAX_BYTES or widest > MAX_UNITS:
         raise InputError(
             f"its layers have {needed:,} bytes and up to {widest:,} units: an encoder's file has "

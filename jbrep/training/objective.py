@@ -34,9 +34,9 @@ class Objective(nn.Module, ABC):
     def prepare(self, windows: Windows) -> None:
         """Fit what is constant in training, such as scales of targets, to training windows."""
 
-    @abstractmethod
     def batch(self, windows: Windows, numbers: Tensor) -> Any:
         """What the loss is of: those windows, as a tuple of tensors (n, ...)."""
+        return windows.steps(numbers)
 
     def draws(
         self, windows: Windows, numbers: Tensor, size: int, generator: torch.Generator
