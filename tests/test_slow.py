@@ -206,7 +206,7 @@ def test_a_block_stays_small_where_most_episodes_are_too_short(tmp_path, monkeyp
         ),
         (
             {"kind": "linear-forward", "changes": 0, "values": 0, "reward": 0},
-            "nothing to predict: all its weights are 0",
+            "nothing that linear-forward is to predict varies",
         ),
     ],
 )

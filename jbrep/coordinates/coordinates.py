@@ -87,12 +87,9 @@ class Coordinates:
     Observations and coordinates are NumPy arrays or torch tensors, with the numbers along the last
     axis. None of the formulas jumps; of a body that stands on its head the heading is lost.
 
-    Args:
+    Attributes:
         task: whose observations they are calculated from.
         parts: in order; each takes features, or what earlier parts give.
-
-    Attributes:
-        task, parts: as given.
         names: of all coordinates, in order.
         sources: the part that each coordinate is of, by name.
     """

@@ -75,14 +75,8 @@ class DAE(Autoencoder, frozen=True, kw_only=True):
 class Reconstruction(Objective):
     """The mean squared error of a reconstruction.
 
-    Batches are (features, rows), corrupted and clean.
-
-    Args:
-        method: says the network.
-        size: scaled numbers d in a row.
-        weights: of each scaled number in the error, (d,); None for 1.
-        noise: standard deviation of the corruption.
-        shared_noise: whether one vector of noise corrupts all rows of a batch.
+    Batches are (features, rows), corrupted and clean. Weights are of each scaled number in the
+    error, (d,), None for 1; `noise` is the standard deviation of the corruption.
     """
 
     _weights: Tensor | None
@@ -105,14 +99,12 @@ class Reconstruction(Objective):
         self._gradient: Gradient | None = None
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Clean rows, twice."""
         clean = windows.rows(numbers).T.contiguous()
         return clean, clean
 
     def draws(
         self, windows: Windows, numbers: Tensor, size: int, generator: torch.Generator
     ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Corrupted and clean rows."""
         clean = windows.rows(numbers).T.contiguous()
         for part in clean.split(size, 1) if self._shared else (clean,):
             corrupted = self._corrupt(part, generator)
@@ -150,12 +142,8 @@ class Gradient:
 
     With so few features a step is limited by memory access and by the number of operations: with
     features first, in preallocated buffers, it takes about half of autograd's time
-    (benchmarks/encoders.py).
-
-    Args:
-        modules: nn.Linear, each followed by an activation, nn.ReLU or nn.Tanh, or by none.
-        rows: the largest batch.
-        weights: of each number in the error, (d,); None for 1.
+    (benchmarks/encoders.py). Modules are nn.Linear, each followed by nn.ReLU, nn.Tanh, or neither;
+    `rows` is the largest batch.
     """
 
     def __init__(self, modules: Iterable[nn.Module], rows: int, weights: Tensor | None = None):
@@ -175,9 +163,7 @@ class Gradient:
     def __call__(self, values: Tensor, target: Tensor) -> Tensor:
         """Set every parameter's gradient, and return the mean squared error.
 
-        Args:
-            values: the input, (features, rows).
-            target: the output to come close to, (features, rows).
+        Values and the target to come close to are (features, rows).
         """
         inputs = [values, *self._cut(self._outputs, values.shape[1])]
         for (linear, activation), before, after in zip(

@@ -12,12 +12,7 @@ _RECORDS = ("training", "data", "metrics", "versions")
 
 
 def describe(encoder: BaseEncoder, source: str) -> dict[str, Any]:
-    """An encoder's card as plain JSON; of a user's own, what is known.
-
-    Args:
-        encoder: the encoder.
-        source: where it was taken from, as `shipped.source_of` says it.
-    """
+    """An encoder's card as plain JSON, with its source, as `source_of` says it."""
     task = encoder.task
     told = {
         "name": encoder.name,
@@ -46,13 +41,7 @@ def describe(encoder: BaseEncoder, source: str) -> dict[str, Any]:
 
 
 def card(encoder: BaseEncoder, source: str, width: int) -> str:
-    """A few lines on an encoder; of a file, also the range of each feature, scaled to [-1, 1].
-
-    Args:
-        encoder: the encoder.
-        source: where it was taken from, as `shipped.source_of` says it.
-        width: columns to fit.
-    """
+    """A few lines on an encoder; of a file, also the range of each feature, scaled to [-1, 1]."""
     told = describe(encoder, source)
     lines = {
         "source": source,

@@ -38,7 +38,7 @@ def _packed(encoder: Encoder, path: Path) -> bytes:
     if len(content) > container.MAX_BYTES:
         raise InputError(
             f"can't save an encoder in {path}: {len(content):,} bytes are more than "
-            f"{container.MAX_BYTES:,}"
+            f"{container.MAX_BYTES:,}, choose smaller layers"
         )
     return content
 

@@ -76,11 +76,8 @@ class DeepMDPObjective(Objective):
         architecture = get_architecture(method.architecture)
         size, self._latent = data.size, method.latent
         inputs = self._latent + data.task.action_size
-        self._weights = {
-            "reward": method.reward,
-            "transition": method.transition,
-            "lipschitz": method.lipschitz,
-        }
+        terms = "reward", "transition", "lipschitz"
+        self._weights = {term: getattr(method, term) for term in terms}
         with seeded(method.seed):
             self.encoder = stack((size, *architecture.hidden, self._latent), architecture.code)
             self.reward = stack((inputs, HIDDEN, HIDDEN, 1), "linear")

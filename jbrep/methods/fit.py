@@ -28,14 +28,7 @@ from jbrep.records.storage import exists, inside, make_folder
 from jbrep.training import checkpoint
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method, Reconstructing
 from jbrep.training.network import check_layers
-from jbrep.training.trainer import (
-    Epoch,
-    Schedule,
-    Trainer,
-    default_batch_size,
-    get_device,
-    single_thread,
-)
+from jbrep.training.trainer import Epoch, Trainer, default_batch_size, get_device, single_thread
 from jbrep.training.windows import Windows, count_windows, watched_windows
 
 _ALIKE = 0.05  # of PCA's error, within which another is as good
@@ -90,13 +83,8 @@ class Fitter:
 
     The encoder `dae-8` is the file `dae-8.safetensors` there; the folder `dae-8.training` beside it
     has TensorBoard's scalars and, until training is finished, the checkpoint to resume from.
-
-    Args:
-        data: to learn from.
-        folder: created if it doesn't exist.
-        device: to train on: cpu, cuda, or auto.
-        memory: bytes that training rows may take: more are read from disk in each epoch, to the
-            same file; None for half of what is free.
+    `memory` is bytes that training rows may take, by default half of what is free: more are read
+    from disk in each epoch, to the same file.
     """
 
     def __init__(
@@ -114,15 +102,10 @@ class Fitter:
         self._windows: dict[tuple[ScaledDataset, int], tuple[Windows, Windows]] = {}
 
     def fit(self, kind: str, *, name: str | None = None, **settings: Any) -> Fitted:
-        """Make an encoder, unless its file is complete already.
+        """Make an encoder by the method `kind`, unless its file is complete already.
 
         An interrupted training leaves its best parameters so far in the file, and its checkpoint,
-        from which the same call resumes.
-
-        Args:
-            kind: a key of METHODS.
-            name: of the encoder; made from the method and its settings if not given.
-            settings: of the method, as text or values.
+        from which the same call resumes. Settings are text or values.
         """
         with single_thread():
             plan = self.plan(kind, name=name, **settings)
@@ -168,7 +151,7 @@ class Fitter:
         return self._data.rescaled(method.scaling, coordinates, method.clip, method.keep)
 
     def _make_once(self, plan: Plan) -> bool:
-        """Make an encoder, unless another process has made it meanwhile; whether it did."""
+        """Make it unless another process has made it meanwhile; whether it did."""
         make_folder(self._folder)
         with exclusive(plan.path, beside=True):
             if plan.is_complete():
@@ -181,21 +164,14 @@ class Fitter:
             case ClosedForm() as method:
                 self._save(plan, method.make(plan.data))
             case Learned() as method:
-                work = inside(self._folder, plan.path.with_suffix(".training").name)
-                make_folder(work)
-                self._train(plan, method, work)
+                self._train(plan, method)
 
-    def _train(self, plan: Plan, method: Learned, work: Path) -> None:
-        """Train from the checkpoint, if there is one, or from the start."""
+    def _train(self, plan: Plan, method: Learned) -> None:
+        work = inside(self._folder, plan.path.with_suffix(".training").name)
+        make_folder(work)
         header, objective = plan.header, method.objective(plan.data).to(self._device)
         windows, watched = self._windows_of(plan.data, objective.horizon)
-        schedule = Schedule(
-            epochs=method.epochs,
-            batch_size=method.batch_size,
-            learning_rate=method.learning_rate,
-            seed=method.seed,
-        )
-        trainer = Trainer(objective, schedule, windows, watched)
+        trainer = Trainer(objective, method, windows, watched)
         versions = {"device": self._device.type, "torch": header.versions["torch"]}
         identity = {**_origin(header), **versions}
         saved = work / "checkpoint.safetensors"
@@ -213,7 +189,6 @@ class Fitter:
         saved.unlink()
 
     def _windows_of(self, data: ScaledDataset, horizon: int) -> tuple[Windows, Windows]:
-        """Windows to train on, and to watch the loss on; those of the last encoder, if they fit."""
         key = data, horizon
         if key not in self._windows:
             train = Windows(data, data.train, horizon, self._device, self._memory)
@@ -281,11 +256,9 @@ def _with_progress(trainer: Trainer, name: str) -> Iterator[Epoch]:
 
 
 def purpose(encoder: Encoder, data: ScaledDataset) -> str:
-    """How good an encoder is at what its kind is for; empty of one that is for nothing of its own.
+    """How good an encoder that was made of these data is at what its kind is for, in words.
 
-    Args:
-        encoder: made of these data by a method.
-        data: to reconstruct, where that is what it is for.
+    Empty of one that is for nothing of its own.
     """
     method = METHODS[encoder.kind]
     if not issubclass(method, Reconstructing | PCA):
@@ -294,18 +267,12 @@ def purpose(encoder: Encoder, data: ScaledDataset) -> str:
     ratio = ratio_to_pca(encoder, data)
     if method is PCA or ratio is None:
         return f"reconstructs held-out states with a mean squared error of {error}"
-    told = (
-        f"reconstructs held-out states {_beside(ratio)} PCA: {ratio:.2f} times its error ({error})"
-    )
+    beside = "better than" if ratio < 1 else "worse than"
+    beside = "as well as" if abs(ratio - 1) < _ALIKE else beside
+    told = f"reconstructs held-out states {beside} PCA: {ratio:.2f} times its error ({error})"
     if ratio <= _POOR:
         return told
     return (
         f"{told}; train for more --epochs, on more data, or with another --learning-rate or "
         "--batch-size"
     )
-
-
-def _beside(ratio: float) -> str:
-    if abs(ratio - 1) < _ALIKE:
-        return "as well as"
-    return "better than" if ratio < 1 else "worse than"

@@ -74,14 +74,10 @@ class _Batch(NamedTuple):
 
 
 class Predictors(nn.Module):
-    """Networks of one shape, of which each reads the first of some shared inputs.
+    """Networks of one shape, of which each reads the first so many of some shared inputs.
 
     Each has two hidden layers of ReLU. Features come first and rows last, and all networks are
     multiplied at once: with so few units, a step of separate ones is bound by calls and by memory.
-
-    Args:
-        reads: for each network, how many of the inputs it reads.
-        outputs: numbers that each gives.
     """
 
     _read: Tensor

@@ -20,12 +20,8 @@ def held_out_error(
 ) -> float:
     """Mean squared error of the reconstruction over all held-out rows, scaled to [-1, 1].
 
-    Rounded to six digits: the others depend on the number of threads.
-
-    Args:
-        encoder: that can decode.
-        data: whose held-out part is reconstructed.
-        not_decoded: names of features whose errors count as 0.
+    Features that are `not_decoded` count as 0. Rounded to six digits: the others depend on the
+    number of threads.
     """
     decoded = [name not in not_decoded for name in data.task.feature_names]
     total = 0.0
@@ -42,12 +38,7 @@ def lost(
 
     An encoder on coordinates is judged by what these tell of the rows: angles round the circle,
     quaternions of either sign, and a robot that symmetry puts at the origin as it stands there.
-
-    Args:
-        encoder: that can decode.
-        rows: in physical units.
-        data: whose scaling counts.
-        given: rows that are encoded in their place, such as corrupted ones.
+    `given` are rows that are encoded in their place, such as corrupted ones.
     """
     back = encoder.decode(encoder.encode(rows if given is None else given))
     if isinstance(encoder, Encoder) and (coordinates := encoder.scaler.coordinates):
@@ -58,14 +49,8 @@ def lost(
 def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
     """An encoder's held-out error as a multiple of PCA's, with as many components.
 
-    Both are of what the encoder tells at all: symmetry leaves out where the robot is.
-
-    Args:
-        encoder: made from this data.
-        data: what PCA is fitted on.
-
-    Returns:
-        The ratio; None where PCA loses nothing.
+    Both are of what the encoder tells at all: symmetry leaves out where the robot is. None where
+    PCA loses nothing.
     """
     if encoder.latent_size >= data.task.size:
         return None

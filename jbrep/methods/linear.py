@@ -85,11 +85,8 @@ def whitening(
 ) -> Array:
     """W with W C W' = I, for a covariance C of the features (size, size).
 
-    Args:
-        covariance: C.
-        data: that it is of.
-        total: variances that show what is negligible, where C is what a regression left of them.
-        others: what features would be linear functions of, if C were singular.
+    `total` are the variances that show what is negligible, where C is what a regression on `others`
+    left of them.
     """
     deviation = np.sqrt(np.maximum(np.diag(covariance) if total is None else total, _TINY))
     variances, vectors = np.linalg.eigh(covariance / np.outer(deviation, deviation))

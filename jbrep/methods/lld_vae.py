@@ -89,7 +89,6 @@ class LldVaeObjective(VariationalObjective):
         return (error + self._beta * prior + self._transition_weight * ahead).mean()
 
     def _negative_log_likelihood(self, code: Tensor, rows: Tensor) -> Tensor:
-        """The negative log-likelihood of rows, (n,)."""
         mean, log_deviation = self.decoder(code).chunk(2, 1)
         log_deviation = log_deviation.clamp(_LEAST, _MOST)
         squares = ((rows - mean) / log_deviation.exp()).square() / 2
@@ -115,15 +114,8 @@ def transition_divergence(
 ) -> Tensor:
     """KL of N(m, A S A') from N(n, T), with A = I + v r', and S and T diagonal, (n,).
 
-    By det A = 1 + v' r nothing of size (l, l) is made (Watter et al. 2015, appendix).
-
-    Args:
-        mean: m, (n, l), as are all the others.
-        log_deviation: half the logarithm of S.
-        left: v.
-        right: r.
-        next_mean: n.
-        next_log_deviation: half the logarithm of T.
+    By det A = 1 + v' r nothing of size (l, l) is made (Watter et al. 2015, appendix). All are
+    (n, l): m, half the logarithm of S, v and r, n, half the logarithm of T.
     """
     variance, precision = (2 * log_deviation).exp(), (-2 * next_log_deviation).exp()
     spread = (right.square() * variance).sum(1, keepdim=True)

@@ -1,5 +1,6 @@
 """OFENet: a code larger than the observation, from which the next observation follows."""
 
+import copy
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, cast
 
@@ -7,6 +8,7 @@ import numpy as np
 import torch
 from msgspec import Meta
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders.layers import Layer, dense
@@ -44,11 +46,8 @@ class OFE(Learned, frozen=True, kw_only=True):
 class DenseBlocks(nn.Module):
     """Layers of which each adds units to all numbers before it (DenseNet): [x, h1, h2, ...].
 
-    A unit is silu(batch norm(w . numbers before)), as in OFENet.
-
-    Args:
-        size: numbers that the first layer takes.
-        widths: units that each layer adds.
+    A unit is silu(batch norm(w . numbers before)), as in OFENet. `widths` are the units that each
+    layer adds.
     """
 
     def __init__(self, size: int, widths: Sequence[int]):
@@ -74,7 +73,8 @@ class DenseBlocks(nn.Module):
         chain: list[Layer] = []
         restore: Array | None = None  # from what a layer gives to the numbers that it stands for
         for linear, norm in zip(self.linears, self.norms, strict=True):
-            weight, bias = _folded(linear, norm)
+            parts: Any = (copy.deepcopy(each).double().eval() for each in (linear, norm))
+            weight, bias = (p.numpy(force=True) for p in fuse_linear_bn_eval(*parts).parameters())
             same = np.eye(weight.shape[1])
             rows = np.vstack((same, -same, weight))
             shift = np.concatenate((np.zeros(2 * len(same)), bias))
@@ -95,23 +95,6 @@ def _normalised(norm: Any, units: Tensor) -> Tensor:
         return cast("Tensor", norm(units))
     running = norm.running_mean, norm.running_var
     return nn.functional.batch_norm(units, *running, norm.weight, norm.bias, eps=norm.eps)
-
-
-def _folded(linear: Any, norm: Any) -> tuple[Array, Array]:
-    """Weight and bias of a linear layer with its batch norm, in evaluation."""
-    weight, bias, mean, variance, scale, shift = (
-        each.detach().cpu().double().numpy()
-        for each in (
-            linear.weight,
-            linear.bias,
-            norm.running_mean,
-            norm.running_var,
-            norm.weight,
-            norm.bias,
-        )
-    )
-    factor = scale / np.sqrt(variance + norm.eps)
-    return weight * factor[:, None], (bias - mean) * factor + shift
 
 
 class OFEObjective(Objective):

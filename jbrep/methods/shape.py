@@ -28,11 +28,7 @@ def complete(
 ) -> Complete:
     """What a method made, with the scale of its code, a decoder, and what passes around them.
 
-    Args:
-        made: by the method.
-        data: scaled.
-        codes: raw, standard or white.
-        keep: features that pass around the layers, unless the method says which.
+    `keep` names features that pass around the layers, unless the method says which.
     """
     encoder, decoder = made.encoder, made.decoder
     if not encoder:

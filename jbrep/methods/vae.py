@@ -134,11 +134,6 @@ def cross_entropy(logits: Tensor, rows: Tensor, weights: Tensor | None) -> Tenso
 
     Scaled values beyond [-1, 1], which held-out rows and scalings other than by extrema have, count
     as its ends: no sigmoid gives more, and beyond them the cross-entropy has no least value.
-
-    Args:
-        logits: of the reconstruction, (n, d).
-        rows: scaled, (n, d).
-        weights: of each number, (d,); None for 1.
     """
     target = ((rows + 1) / 2).clamp(0, 1)
     return binary_cross_entropy_with_logits(logits, target, weights, reduction="none")

@@ -13,7 +13,7 @@ from jbrep.errors import InputError
 from jbrep.records.record import Record, default_of, from_text, to_plain
 from jbrep.records.words import bare, type_of
 from jbrep.training.network import get_architecture
-from jbrep.training.objective import Layers, Objective, feature_weights
+from jbrep.training.objective import Layers, Objective
 from jbrep.training.settings import (
     BatchSize,
     Clip,
@@ -111,9 +111,7 @@ class Method(Record, frozen=True, kw_only=True):
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
         """How good an encoder is at what the method is for, in words; empty if that isn't known.
 
-        Args:
-            metrics: of the encoder's header.
-            latent: size of its code.
+        By the metrics of its header; `latent` is the size of its code.
         """
         return ""
 
@@ -195,10 +193,6 @@ class Reconstructing(Learned, frozen=True, kw_only=True):
     """A method that learns to reconstruct rows, with weights of their features."""
 
     weights: FeatureWeights = field(default_factory=dict)
-
-    def check_data(self, data: ScaledDataset) -> None:
-        super().check_data(data)
-        feature_weights(data, self.weights)
 
 
 def _read(value: Any, kind: Any, name: str) -> Any:

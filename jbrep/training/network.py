@@ -19,10 +19,8 @@ from jbrep.records.container import MAX_BYTES
 class AvgL1Norm(nn.Module):
     """Divides values (..., units) by their average magnitude."""
 
-    def forward(self, values: Tensor) -> Tensor:
-        """The values on a mean magnitude of 1."""
-        normalised: Tensor = activate(AVG_L1_NORM, values)
-        return normalised
+    def forward(self, values: Tensor) -> Any:
+        return activate(AVG_L1_NORM, values)
 
 
 _MODULES = {"relu": nn.ReLU, "tanh": nn.Tanh, AVG_L1_NORM: AvgL1Norm}
@@ -92,14 +90,9 @@ def seeded(seed: int) -> Iterator[None]:
 def stacks(
     architecture: Architecture, size: int, latent: int, seed: int, initial: str = "torch"
 ) -> tuple[nn.Sequential, nn.Sequential]:
-    """Encoder and decoder, from d numbers to l and back; untrained.
+    """Encoder and decoder, from `size` numbers to `latent` and back; untrained.
 
-    Args:
-        architecture: the layers between.
-        size: numbers d.
-        latent: numbers l.
-        seed: of the weights.
-        initial: `torch` for its initial weights, `normal` for N(0, 1) with biases of 0.
+    The weights are torch's own, or, where `initial` is normal, of N(0, 1) with biases of 0.
     """
     sizes = (size, *architecture.hidden, latent)
     with seeded(seed):

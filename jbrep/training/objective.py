@@ -43,11 +43,7 @@ class Objective(nn.Module, ABC):
     ) -> Iterator[Any]:
         """Batches of at most `size` windows, in order; runs beside the training, a little ahead.
 
-        Args:
-            windows: to train on.
-            numbers: of the windows.
-            size: of a batch.
-            generator: to draw noise from.
+        Noise is drawn from the generator.
         """
         parts = (part.split(size) for part in self.batch(windows, numbers))
         yield from zip(*parts, strict=True)
@@ -67,9 +63,7 @@ class Objective(nn.Module, ABC):
     def rate(self, progress: float, step: int) -> float:
         """What the learning rate is multiplied by: by default falling to 0 along a cosine.
 
-        Args:
-            progress: share of the training that is done.
-            step: gradient steps so far.
+        `progress` is the share of the training that is done, `step` counts gradient steps.
         """
         return (1 + math.cos(math.pi * progress)) / 2
 
