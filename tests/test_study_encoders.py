@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-import torch
 from command import in_this_process, jbrep
 from jbrep.report.facts import encoder_table, outline, reproduce
 from jbrep.report.figures.diagrams import autoencoders
@@ -26,7 +25,6 @@ from jbrep.encoders import find, load, save
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
 from jbrep.errors import DamageError, InputError
-from jbrep.evaluate.diagnosis import hashes
 from jbrep.evaluate.evaluation import EVALUATION, Score
 from jbrep.evaluate.table import DIAGNOSTICS, read_diagnostics
 from jbrep.records.record import to_plain
@@ -41,7 +39,7 @@ from jbrep.study.prepare import prepare
 from jbrep.study.record import EACH_ITS_OWN, RECORD
 from jbrep.study.results import write_tables
 from jbrep.study.runner import run_study
-from jbrep.study.tables import RETURNS, add_diagnostics
+from jbrep.study.tables import add_diagnostics
 from jbrep.study.work import Assigned, work
 
 TASK = "face_direction"
@@ -102,6 +100,7 @@ def write_onnx(net, path):
 PATTERN = {"name": "mine", "file": "encoders/{task}/mine-{seed}.safetensors"}
 CODE = {"name": "net", "code": NET}
 DENSE = {"name": "dense", "code": "my_encoders:dense"}
+OWN = {each["name"]: each["code"] for each in (CODE, DENSE)}
 FROM_ONNX = {"name": "from-onnx", "file": "from-onnx.safetensors"}
 
 
@@ -122,34 +121,11 @@ def test_each_run_has_its_encoder(done):
         settings = read_run(folder).settings
         assert settings.representation == name
         assert settings.encoder_seed == (cell.seed if name == "mine" else None)
-        assert settings.encoder_code == (NET if name == "net" else None)
-        assert (folder / ENCODER).exists() == (name != "net")
+        assert settings.encoder_code == OWN.get(name)
+        assert (folder / ENCODER).exists() == (name not in OWN)
         if name == "mine":
             assert load(folder / ENCODER).name == ("pca-8", "random-8")[cell.seed]
             assert load_run(folder).representation == "mine"
-
-
-def test_a_module_and_its_onnx_model_give_equal_tables(done):
-    """The module is kept as a file, too."""
-    rows = (done.folder / RETURNS).read_text().splitlines()
-    of_module, of_file = (
-        [row.replace(name, "it") for row in rows if f",{name}," in row]
-        for name in ("dense", "from-onnx")
-    )
-    assert len(of_module) == 22
-    assert of_module == of_file
-    folder = done.folder_of(next(c for c in done.cells if c.representation.name == "dense"))
-    assert read_run(folder).settings.encoder_code is None
-    kept, net = load(folder / ENCODER), dense()
-    for ours, theirs in zip(kept.encoder, load(Path("from-onnx.safetensors")).encoder, strict=True):
-        assert all(map(np.array_equal, ours, theirs))
-    seen = kept.task.unscale(np.random.default_rng(0).uniform(-1, 1, (9, SIZE))).astype("float32")
-    np.testing.assert_allclose(kept.encode(seen), net(torch.tensor(seen)).detach(), atol=1e-5)
-    assert load_run(folder, net).encoder.fingerprint == kept.fingerprint
-    with torch.no_grad():
-        net[0].bias += 1
-    with pytest.raises(InputError, match="is not the encoder that the run"):
-        load_run(folder, net)
 
 
 def test_runs_with_an_encoder_each_stand_under_one_label(done):
@@ -207,10 +183,9 @@ def test_diagnostics_are_matched_by_the_encoders(done, tmp_path):
 
 
 def test_an_evaluation_knows_code_by_the_hash_of_its_runs(done):
-    own = {"dense": DENSE["code"], "net": CODE["code"]}  # kept as a file, and not
-    known = hashes({name: find(code, SHARED["task"]) for name, code in own.items()})
+    known = {name: find(code, SHARED["task"]).fingerprint for name, code in OWN.items()}
     for cell in done.cells:
-        if (name := cell.representation.name) in own:
+        if (name := cell.representation.name) in OWN:
             assert read_run(done.folder_of(cell)).settings.encoder == known[name]
 
 

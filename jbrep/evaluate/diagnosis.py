@@ -13,7 +13,6 @@ from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.settings import IMPORTED
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import as_file
 from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
 from jbrep.evaluate import control, readout
@@ -52,7 +51,7 @@ def write(
             there = read_document(path, Evaluation)
             known = there.data.fingerprint, there.data.truth, there.hashes, there.policy
             on = data.dataset.manifest.fingerprint, truth.manifest.fingerprint if truth else UNSET
-            if known != (*on, hashes(judged), policy.name if policy else None):
+            if known != (*on, _hashes(judged), policy.name if policy else None):
                 other = f"{path} is not an evaluation of these encoders on this data"
                 raise InputError(f"{other}: choose another --out")
         evaluation = diagnose(judged, data, policy, truth)
@@ -78,7 +77,7 @@ def diagnose(
     header = EncoderHeader(kind=FULL, name=FULL, environment=data.task)
     full = Encoder(header, data.scaler, (), ())
     results, needed = _side_by_side({FULL: full, **judged}, held_out, policy)
-    sha256 = hashes(judged)
+    sha256 = _hashes(judged)
     return Evaluation(
         data=_judged_on(held_out),
         resamples=RESAMPLES,
@@ -89,10 +88,8 @@ def diagnose(
     )
 
 
-def hashes(encoders: Mapping[str, BaseEncoder]) -> dict[str, str]:
-    """SHA-256 of encoders by label; of a module, that of the file that a run keeps of it."""
-    with single_thread():
-        return {label: as_file(encoder).fingerprint for label, encoder in encoders.items()}
+def _hashes(encoders: Mapping[str, BaseEncoder]) -> dict[str, str]:
+    return {label: encoder.fingerprint for label, encoder in encoders.items()}
 
 
 def _side_by_side(
