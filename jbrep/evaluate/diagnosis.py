@@ -64,7 +64,7 @@ def _before(
     """The evaluation of the same that a repeated one replaces, if there is one."""
     if not exists(path):
         return None
-    on = data.dataset.manifest.fingerprint, _fingerprint(truth)
+    on = data.dataset.fingerprint, _fingerprint(truth)
     wanted = *on, encoders, policy.name if policy else None
     there = read_document(path, Evaluation)
     if (there.data.fingerprint, there.data.truth, there.hashes, there.policy) == wanted:
@@ -75,7 +75,7 @@ def _before(
 
 
 def _fingerprint(truth: Dataset | None) -> str | UnsetType:
-    return truth.manifest.fingerprint if truth else UNSET
+    return truth.fingerprint if truth else UNSET
 
 
 def diagnose(
@@ -245,7 +245,7 @@ def seen(encoder: BaseEncoder, data: ScaledDataset) -> Literal["no test row", "n
     """Which of these rows an encoder saw in training."""
     source = encoder.header.data if isinstance(encoder, Encoder) else {}
     manifest = data.dataset.manifest
-    if source.get("fingerprint") == manifest.fingerprint:
+    if source.get("fingerprint") == data.dataset.fingerprint:
         return "no test row"
     policy = source.get("policy")
     kinds = [manifest.settings.policy["kind"]]
@@ -259,7 +259,7 @@ def _judged_on(held_out: HeldOut, truth: Dataset | None) -> JudgedOn:
     data, manifest = held_out.data, held_out.data.dataset.manifest
     return JudgedOn(
         task=data.task.name,
-        fingerprint=manifest.fingerprint,
+        fingerprint=data.dataset.fingerprint,
         policy=dict(manifest.settings.policy),
         seed=manifest.settings.seed,
         train_rows=len(data.train),
