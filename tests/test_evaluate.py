@@ -489,7 +489,7 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
 
 
 def test_whether_an_encoder_may_have_seen_the_episodes(data):
-    fingerprint = data.dataset.manifest.fingerprint
+    fingerprint = data.dataset.fingerprint
     for source, seed, policy, expected in (
         (fingerprint, 3, {}, "no test row"),
         ("other", 3, {}, "maybe"),

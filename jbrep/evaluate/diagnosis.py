@@ -50,7 +50,7 @@ def write(
         if exists(path):
             there = read_document(path, Evaluation)
             known = there.data.fingerprint, there.data.truth, there.hashes, there.policy
-            on = data.dataset.manifest.fingerprint, truth.manifest.fingerprint if truth else UNSET
+            on = data.dataset.fingerprint, truth.fingerprint if truth else UNSET
             if known != (*on, _hashes(judged), policy.name if policy else None):
                 other = f"{path} is not an evaluation of these encoders on this data"
                 raise InputError(f"{other}: choose another --out")
@@ -173,7 +173,7 @@ def seen(encoder: BaseEncoder, data: ScaledDataset) -> Literal["no test row", "n
     """Which of these rows an encoder saw in training."""
     source = encoder.header.data if isinstance(encoder, Encoder) else {}
     manifest = data.dataset.manifest
-    if source.get("fingerprint") == manifest.fingerprint:
+    if source.get("fingerprint") == data.dataset.fingerprint:
         return "no test row"
     policy = source.get("policy")
     kinds = [manifest.settings.policy["kind"]]
@@ -187,13 +187,13 @@ def _judged_on(held_out: HeldOut) -> JudgedOn:
     data, manifest = held_out.data, held_out.data.dataset.manifest
     return JudgedOn(
         task=data.task.name,
-        fingerprint=manifest.fingerprint,
+        fingerprint=data.dataset.fingerprint,
         policy=dict(manifest.settings.policy),
         seed=manifest.settings.seed,
         train_rows=len(data.train),
         test_rows=len(data.test),
         test_episodes=len(held_out.numbers),
         constant_features=data.constant_features,
-        truth=held_out.shown.manifest.fingerprint if held_out.shown else UNSET,
+        truth=held_out.shown.fingerprint if held_out.shown else UNSET,
         hidden=held_out.hidden or UNSET,
     )

@@ -225,7 +225,7 @@ def _header(method: Method, name: str, data: ScaledDataset) -> EncoderHeader:
         environment=data.task,
         training=method.training,
         data={
-            "fingerprint": manifest.fingerprint,
+            "fingerprint": data.dataset.fingerprint,
             "policy": dict(manifest.settings.policy),
             "seed": manifest.settings.seed,
             "train_rows": len(data.train),
