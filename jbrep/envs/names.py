@@ -63,7 +63,7 @@ def spec_of(task: Task) -> EnvSpec:
         for module in modules_of(task):
             raise InputError(
                 f"unknown task {task.id!r}: {module} defines it; add --import "
-                f"{shlex.quote(module)}: this runs its code"
+                f"{shlex.quote(module)}, or the module that registers it: this runs its code"
             ) from None
         raise
 
