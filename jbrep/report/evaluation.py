@@ -166,14 +166,14 @@ def _readings(encoders: _Encoders) -> Table:
 
 
 def _scores(encoders: _Encoders) -> Table:
-    """All diagnostics but those of the headline, a row each."""
+    """All diagnostics but those of the headline."""
+    others = [each for each in SCALARS.values() if not each.is_first]
     return Table(
         "All other diagnostics",
-        ("diagnostic", *encoders),
+        ("encoder", *(each.name for each in others)),
         [
-            (each.name, *(number(_value(each, e), SIGNIFICANT) for e in encoders.values()))
-            for each in SCALARS.values()
-            if not each.is_first
+            (label, *(number(_value(each, known), SIGNIFICANT) for each in others))
+            for label, known in encoders.items()
         ],
     )
 
