@@ -20,7 +20,6 @@ from matplotlib.text import Text
 from PIL import Image
 
 from jbrep.envs import describe
-from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import (
     KEPT,
     Evaluation,
@@ -29,9 +28,8 @@ from jbrep.evaluate.evaluation import (
     Reconstruction,
     Score,
 )
-from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, observe
 from jbrep.records.document import read_document
-from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, write
+from jbrep.report.figures import encoder_plots, study_plots, write
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
@@ -484,67 +482,6 @@ def test_names_stand_where_they_cover_nothing():
     assert places[0][0] < 0 < places[1][0]  # a to the left of its point, b to the right
     crowd = np.full((5, 2), 0.5)
     assert None in _free(["a-long-name"] * 5, crowd)
-
-
-@pytest.fixture(scope="module")
-def behaviours():
-    sources = ("constant:drive=0.5", "heuristic")
-    return observe(sources, describe("move_in_direction"), episodes=3, target_yaw=np.pi / 6)[1]
-
-
-def test_a_constant_drive_turns_the_motor_one_way(behaviours):
-    constant, heuristic = behaviours
-    middles = (SPEEDS[1:] + SPEEDS[:-1]) / 2
-    assert constant.motor.sum() == pytest.approx(1)
-    assert constant.motor[middles > 50].sum() > 0.9  # 145 rad/s at full drive
-    assert fast_shares(constant) == pytest.approx(
-        (0, constant.motor[middles > FAST].sum()), abs=1e-12
-    )
-    assert heuristic.motor[middles < -20].sum() > 0.2
-    assert heuristic.motor[middles > 20].sum() > 0.2
-
-
-def test_the_heuristic_goes_where_the_target_points(behaviours):
-    _, heuristic = behaviours
-    assert heuristic.places.sum() == pytest.approx(1)
-    x, y = heuristic.mean_place
-    assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(30, abs=14)
-    middles = (heuristic.edges[1:] + heuristic.edges[:-1]) / 2
-    shares = heuristic.places.sum(axis=1), heuristic.places.sum(axis=0)
-    np.testing.assert_allclose([share @ middles for share in shares], (x, y), atol=0.01)
-    assert len(heuristic.returns) == 3
-
-
-def test_behaviour_is_drawn_from_its_tables(behaviours, tmp_path):
-    motor, places = behaviour_plots("move_in_direction", behaviours, SPEEDS, np.pi / 6)
-    assert len(motor.rows) == 2 * 72
-    axes = drawn(motor).axes[0]
-    np.testing.assert_allclose(axes.patches[0].get_data().values, 100 * behaviours[0].motor)
-    seen = [float(row[3]) for row in places.rows if row[0] == "heuristic"]
-    assert sum(seen) == pytest.approx(1)
-    mesh = drawn(places).axes[1].collections[0].get_array()
-    places_of_heuristic = behaviours[1].places
-    np.testing.assert_array_equal(mesh.filled(0), places_of_heuristic.T)  # y goes up
-    write((motor, places), tmp_path)
-
-
-def test_before_and_after_training_stand_one_above_the_other(behaviours):
-    titles = [f"{name}, {when}" for name in "abc" for when in ("before training", "4 runs")]
-    several = [replace(behaviours[0], name=title) for title in titles]
-    _, places = behaviour_plots("move_in_direction", several, SPEEDS, np.pi / 4)
-    panel = {axes.get_title(loc="left").split("\nreturn")[0]: axes for axes in drawn(places).axes}
-    for name in "abc":
-        above, below = (panel[f"{name}\n{when}"] for when in ("before training", "4 runs"))
-        above, below = (axes.get_subplotspec() for axes in (above, below))
-        assert (above.rowspan.start, below.rowspan.start) == (0, 1)
-        assert above.colspan == below.colspan
-
-
-def test_the_task_of_a_policy_is_needed_and_no_data_set():
-    with pytest.raises(InputError, match="face_direction is a data set: give the folder of a"):
-        observe(("data/sample/face_direction",), None, 1, 0)
-    with pytest.raises(InputError, match="policy heuristic needs a --task"):
-        observe(("heuristic",), None, 1, 0)
 
 
 def scores(quality):

@@ -375,7 +375,4 @@ SURFACES = {  # by name, what makes them of `Shared`
     "render": lambda shared: _of_a_run(
         shared.run, "render run --size 64x64 --out it.gif", "it.gif"
     ),
-    "behaviour": lambda shared: _of_a_run(
-        shared.run, "behaviour run --episodes 1 --out it", "it/*"
-    ),
 }
