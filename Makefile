@@ -161,7 +161,7 @@ policies: $(READY) ## the trained policies that ship, anew: an hour and a half; 
 	$(BIN)/python tools/policies.py runs/policies runs/policies-face-direction runs/policies-move-to-pose
 
 behaviour: $(READY) ## results/behaviour/ anew, of the agents of make answer-move-in-direction
-	$(BIN)/jbrep behaviour $(addprefix runs/answer-move-in-direction/runs/move_in_direction/drawn-sac/,full symmetry forward-8-symmetry dae-12) \
+	$(BIN)/python examples/paper/behaviour.py $(addprefix runs/answer-move-in-direction/runs/move_in_direction/drawn-sac/,full symmetry forward-8-symmetry dae-12) \
 	  --episodes 4 --out results/behaviour
 
 clean: ## remove the environment and the demo's files

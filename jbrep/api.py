@@ -233,7 +233,6 @@ def evaluate(
     *,
     policy: str | None = None,
     truth: "Dataset | str | Path | None" = None,
-    agents: bool = False,
 ) -> Judged:
     """Judge encoders on the held-out part of a data set, as `jbrep evaluate` does.
 
@@ -244,20 +243,13 @@ def evaluate(
         out: a folder for evaluation.json; None to write nothing.
         policy: that does the task well; None for the task's hand-written one, if there is one.
         truth: the data set that `data` was derived from, with what it hides.
-        agents: whether to find out what small agents return that observe each; see docs/worth.md.
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
     from jbrep.evaluate.evaluation import EVALUATION
     from jbrep.records.storage import make_folder
 
-    if agents and out is None:
-        raise InputError("agents' runs are kept: give out, a folder")
     scaled = ScaledDataset.of(data)
-    if agents:
-        from jbrep.worth import check
-
-        check(scaled.dataset)
     whole = Dataset(truth) if isinstance(truth, str | Path) else truth
     if whole is not None:
         from jbrep.evaluate.held_out import hidden_of
@@ -273,12 +265,7 @@ def evaluate(
     good = find_good_policy(policy, scaled.task, own_rewards)
     if out is None:
         return Judged(diagnose(found, scaled, good, whole))
-    evaluation = write(found, scaled, Path(out), good, whole)
-    if not agents:
-        return Judged(evaluation)
-    from jbrep.worth import add_worth
-
-    return Judged(add_worth(evaluation, found, scaled.task, Path(out)))
+    return Judged(write(found, scaled, Path(out), good, whole))
 
 
 def train(

@@ -7,8 +7,7 @@ from tensors import TensorWindows, torch_threads
 from torch.nn.functional import mse_loss
 
 from jbrep.dae import AE, DAE
-from jbrep.dae.autoencoder import Reconstruction
-from jbrep.dae.gradient import Gradient
+from jbrep.dae.autoencoder import Gradient, Reconstruction
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.records import container

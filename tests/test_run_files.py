@@ -133,7 +133,7 @@ def test_a_field_of_a_run_that_cant_be_is_named(path, value, run):
     assert path[-1] in told
 
 
-@pytest.mark.parametrize("content", [b"[]", b'{"format": "jbrep run", "format_version": 5}'])
+@pytest.mark.parametrize("content", [b"[]", b'{"format": "jbrep run", "format_version": 7}'])
 def test_a_run_file_of_anything_else(content, run):
     (run / RUN).write_bytes(content)
     assert RUN in refused(read_run, run)

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from jbrep.report.returns import return_form
+from jbrep.report.statistics import statistics_text
 from scipy import optimize, stats
 
 from jbrep.errors import InputError
-from jbrep.report.returns import return_form
-from jbrep.report.statistics import statistics_text
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.aggregates import aggregates
 from jbrep.stats.analysis import to_plain
@@ -218,7 +218,7 @@ def test_runs_with_other_grids_are_compared_where_all_have_evaluations():
 
 def test_a_failed_run_counts_as_zero_and_does_not_shorten_the_others():
     failed = make(seed=2, steps=GRID[:5], failed_at=3500)
-    never = make(seed=3, steps=[], returns=[], failed_at=10, total_steps=5000)
+    never = make(seed=3, steps=NONE, returns=np.ones((0, 1)), failed_at=10, total_steps=5000)
     grid, cut = common_grid({"full": [*TWO, failed, never]})
     np.testing.assert_array_equal(grid, GRID)
     assert cut is None
@@ -233,7 +233,7 @@ def test_a_failed_run_counts_as_zero_and_does_not_shorten_the_others():
 
 
 def test_a_label_whose_runs_all_failed_is_described():
-    failed = [make("dae-8", i, steps=[], returns=[], failed_at=0) for i in range(3)]
+    failed = [make("dae-8", i, steps=NONE, returns=np.ones((0, 1)), failed_at=0) for i in range(3)]
     found = analyse([*TWO, *failed])
     assert found.groups[0].labels[1].numbers["final_return_mean"].tolist() == [0, None, None]
     alone = analyse([replace(run, representation="full") for run in failed])
@@ -243,7 +243,7 @@ def test_a_label_whose_runs_all_failed_is_described():
 
 def test_what_gains_count_over_is_of_the_starts_of_runs_that_were_evaluated():
     runs = [make(seed=i, returns=np.full((len(GRID), 5), 300.0)) for i in range(3)]
-    early = make(seed=0, steps=[], returns=[], failed_at=0)
+    early = make(seed=0, steps=NONE, returns=np.ones((0, 1)), failed_at=0)
     played = {"face_direction": {"random": [900.0, 0, 0, 0, 0]}}
     (group,) = analyse(
         [early, *(replace(run, seed=run.seed + 1) for run in runs)], references=played

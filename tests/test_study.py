@@ -15,7 +15,6 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import gymnasium
-import numpy as np
 import pytest
 import robots
 from command import (
@@ -26,18 +25,16 @@ from command import (
     wait_for_the_end_of,
     workers_of,
 )
+from jbrep.report.statistics import results_text
 from small import adopt, forge
 
 from jbrep.dataset import Dataset
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.errors import DamageError, InputError
-from jbrep.play.behaviour import observe
 from jbrep.play.sources import find_player, find_untrained
 from jbrep.report.report import statistics
-from jbrep.report.statistics import results_text
 from jbrep.report.tables import read_tables
-from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, RUN, read_run
 from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.stats.rules import Rules
@@ -431,7 +428,7 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
 
 def test_each_run_says_which_module_is_not_here(tmp_path):
     plan = Plan(TINY.replace(representations=("full",)), tmp_path)
-    ended = work(plan.assigned(plan.cells), modules=["robots_elsewhere"])
+    ended = [work(plan.assigned(cell), modules=["robots_elsewhere"]) for cell in plan.cells]
     assert [each.status for each in ended] == ["crashed"] * 2
     assert all("can't import robots_elsewhere" in each.message for each in ended)
 
@@ -454,7 +451,7 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     finished, begun, *_ = plan.cells
     shutil.copytree(done.folder_of(finished), plan.folder_of(finished))
     stop = iter((False, True)).__next__  # after its first rollout
-    assert work(plan.assigned([begun]), stop) is None
+    assert work(plan.assigned(begun), stop) is None
     assert (plan.folder_of(begun) / CHECKPOINT).exists()
     reported = jbrep("report", out, "--json")
     assert reported.exit_code == 0, reported.output
@@ -635,28 +632,10 @@ def test_a_folder_without_runs_is_refused(tmp_path):
         read_runs(tmp_path)
 
 
-def test_the_runs_below_a_folder_behave_as_one_policy(done):
-    folder = done.folder / "runs" / "face_direction" / "a2c" / "full"
-    task, (before, after) = observe([str(folder)], None, 3, 0.5)
-    assert [before.name, after.name] == ["full, before training", "full, 2 runs"]
-    seeds = [folder / f"seed-{seed}" for seed in (0, 1)]
-    _, (_, *others) = observe([str(folder), str(seeds[1]), "still"], task, 1, 0.5)
-    names = ["full, 2 runs", "full/seed-1, before training", "full/seed-1", "still"]
-    assert [each.name for each in others] == names
-    alone = [observe([str(each)], None, 3, 0.5)[1][1] for each in seeds]
-    np.testing.assert_array_equal(after.returns, np.concatenate([each.returns for each in alone]))
-    np.testing.assert_allclose(after.motor, np.mean([each.motor for each in alone], axis=0))
-
-
-def test_a_run_is_drawn_before_and_after_training_with_the_same_body(done, tmp_path):
+def test_a_run_is_played_before_and_after_training_with_another_body(done):
     run = done.folder / "runs" / "face_direction" / "a2c" / "full" / "seed-0"
     other = describe("face_direction", {"body": 7}, 100)
     assert find_untrained(run, other).task == find_player(str(run), other).task == other
-    task, _ = observe([str(run)], other, 1, 0.5)
-    assert task == other
-    train(Run.of(other, "a2c", steps=80, evaluation_episodes=1, preset="paper"), tmp_path / "other")
-    with pytest.raises(InputError, match="with another body or time limit than the policies bef"):
-        observe([str(run), str(tmp_path / "other")], None, 1, 0.5)
 
 
 def test_tasks_may_come_and_go_whichever_was_collected(tmp_path):

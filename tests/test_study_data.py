@@ -65,8 +65,7 @@ def test_representations_are_made_from_their_own_data(made):
         assert headers["pca-4"].data["policy"]["kind"] == "uniform"
         assert headers["late-s1"].data["policy"]["kind"] == "mixture"
         for name, number, table in (("pca-4", 0, "apart"), ("late-s1", 1, "mixed")):
-            manifest = read_manifest(made.data(task, number, table))
-            assert manifest.fingerprint == seen[name]
+            assert Dataset(made.data(task, number, table)).fingerprint == seen[name]
 
 
 def test_data_hold_what_the_mixture_says(made):

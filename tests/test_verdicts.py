@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import jbrep
+from jbrep.report.words import conclusion, told, verdict_cells
 from made_up import SEEDS, STUDY, make_runs, of_a_commit
 from small import adopt
 
@@ -16,7 +17,6 @@ from jbrep.records.record import to_plain
 from jbrep.report import report
 from jbrep.report.report import write_report
 from jbrep.report.tables import read_tables
-from jbrep.report.words import conclusion, told, verdict_cells
 from jbrep.stats.bootstrap import Interval
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan

@@ -9,10 +9,13 @@ from jbrep.cli.base import PATH, RESUMES, as_json
 from jbrep.cli.environment import import_option
 from jbrep.cli.output import echo_json, echo_paths, echo_text, say, tell
 from jbrep.cli.signals import stoppable
-from jbrep.text import terminal_width
+from jbrep.text import Table, duration, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.report.report import Report
+    from jbrep.report.views import Cells
+    from jbrep.stats.rules import Planned
+    from jbrep.study.forecast import Forecast
 
 _COUNT = click.IntRange(1, 1024)
 
@@ -87,7 +90,6 @@ def study(
 
 def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> None:
     """Say what a study is going to do, or write it down before the first run."""
-    from jbrep.report.statistics import forecast_text
     from jbrep.study import Plan, read_study, register_study
     from jbrep.study.forecast import forecast
     from jbrep.study.registration import registration_in
@@ -97,13 +99,53 @@ def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> N
     for notice in plan.study.notices:
         tell(notice, err=True)
     if expected:
-        return click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
+        return click.echo(_forecast_text(expected, plan.study.planned, terminal_width()))
     registered = register_study(plan)
     found = registration_in(registered)
     click.echo(f"registered on {found.date} (SHA-256 {found.sha256})")
     if plan.in_git:
         tell(f"Commit {registered.name}, then run the study: before, it is refused.", err=True)
     return echo_paths([registered])
+
+
+def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
+    """The runs to go, how long they would take, and what could be found of its claims."""
+    from jbrep.report.views import in_text, probability, say
+    from jbrep.stats.power import BETTER_BY, EARLIER_BY, SDS
+
+    to_go: dict[str, list[float]] = {}
+    for cell, seconds in forecast.runs:
+        to_go.setdefault(cell.label, []).append(seconds)
+    runs: Cells = {
+        "agents": lambda item: item[0],
+        "runs": lambda item: str(len(item[1])),
+        "time of each": lambda item: duration(max(item[1])),
+    }
+    made_first: Cells = {
+        "made first": lambda cost: cost.what,
+        "to go": lambda cost: str(cost.to_go),
+        "done": lambda cost: str(cost.done),
+        "time on one core": lambda cost: duration(cost.seconds),
+    }
+    prospects: Cells = {
+        "on": lambda each: each.where,
+        "claim": lambda each: str(each.claim),
+        "units": lambda each: str(each.units),
+        "level": lambda each: probability(each.level),
+        "least p": lambda each: probability(each.least_p),
+        "power": lambda each: ", ".join(f"{100 * power:.0f} %" for power in each.power),
+        "unseen": lambda each: f"{100 * each.unseen:.0f} %",
+    }
+    parts: list[str | Table] = [Table.of("", to_go.items(), runs)] if to_go else []
+    on_one_core = sum(seconds for _, seconds in forecast.runs)
+    parts.append(say("forecast", forecast, duration(on_one_core), duration(forecast.elapsed)))
+    parts += [Table.of("", forecast.made_first, made_first)] if forecast.made_first else []
+    if forecast.prospects:
+        count = len(planned.rules.chains) * len(planned.groups)
+        parts.append(Table.of("", forecast.prospects, prospects))
+        parts.append(say("rules", count, planned.rules.error, len(planned.seeds)))
+        parts.append(say("power", SDS, BETTER_BY, EARLIER_BY))
+    return "\n\n".join(in_text(part, width) for part in parts)
 
 
 @click.command(epilog="Example: jbrep report runs/demo")
@@ -138,17 +180,14 @@ def report(
 
 
 def _show(made: "Report", everything: bool = False, as_json: bool = False) -> None:
-    import json
-
-    from jbrep.report.report import SUMMARY
-    from jbrep.report.statistics import results_text
+    from jbrep.report.report import results_text
 
     if not as_json:
-        echo_text(results_text(made.tables, terminal_width(), everything))
+        echo_text(results_text(made.findings, terminal_width(), everything))
     for line in made.notes:
         say(line, err=True)
     if as_json:
-        return echo_json(json.loads((made.folder / SUMMARY).read_bytes()))
+        return echo_json(made.findings.as_json())
     beside = ", ".join(path.name for path in made.paths if path != made.page)
     more = "" if everything else " --all prints every table."
     click.echo()

@@ -1,7 +1,6 @@
 """How well encoders reconstruct held-out rows, and how they compare with PCA."""
 
 from collections.abc import Container
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,8 @@ def held_out_error(
 ) -> float:
     """Mean squared error of the reconstruction over all held-out rows, scaled to [-1, 1].
 
-    Rounded to six digits: the others depend on the number of threads.
-
-    Args:
-        encoder: that can decode.
-        data: whose held-out part is reconstructed.
-        not_decoded: names of features whose errors count as 0.
+    Features that are `not_decoded` count as 0. Rounded to six digits: the others depend on the
+    number of threads.
     """
     decoded = [name not in not_decoded for name in data.task.feature_names]
     total = 0.0
@@ -36,7 +31,7 @@ def held_out_error(
 
 
 def lost(
-    encoder: BaseEncoder, rows: NDArray[np.float32], data: ScaledDataset, given: Any = None
+    encoder: BaseEncoder, rows: NDArray[np.float32], data: ScaledDataset
 ) -> NDArray[np.float32]:
     """What a reconstruction of rows (n, d) lacks, in half widths of the features in the data.
 
@@ -47,9 +42,8 @@ def lost(
         encoder: that can decode.
         rows: in physical units.
         data: whose scaling counts.
-        given: rows that are encoded in their place, such as corrupted ones.
     """
-    back = encoder.decode(encoder.encode(rows if given is None else given))
+    back = encoder.decode(encoder.encode(rows))
     if isinstance(encoder, Encoder) and (coordinates := encoder.scaler.coordinates):
         rows = coordinates.inverse(coordinates.forward(rows))
     return (encoder.comparable(back, rows) - rows) / data.scaler.half_width
@@ -58,14 +52,8 @@ def lost(
 def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
     """An encoder's held-out error as a multiple of PCA's, with as many components.
 
-    Both are of what the encoder tells at all: symmetry leaves out where the robot is.
-
-    Args:
-        encoder: made from this data.
-        data: what PCA is fitted on.
-
-    Returns:
-        The ratio; None where PCA loses nothing.
+    Both are of what the encoder tells at all: symmetry leaves out where the robot is. None where
+    PCA loses nothing.
     """
     if encoder.latent_size >= data.task.size:
         return None

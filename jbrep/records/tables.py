@@ -42,8 +42,19 @@ def hash_of(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def read_csv(path: Path, columns: Columns, sha256: str | None = None) -> list[tuple[Any, ...]]:
-    """The rows of a table of these columns, and of that SHA-256 if it is known.
+def read_csv(
+    path: Path,
+    columns: Columns,
+    sha256: str | None = None,
+    further: Callable[[str], Any] | None = None,
+) -> list[tuple[Any, ...]]:
+    """The rows below the header, each cell as its column has it.
+
+    Args:
+        path: of the file.
+        columns: the header must have these, and no others unless `further` is given.
+        sha256: of the file, if it is known.
+        further: what cells of all other columns are; each row then ends with a dictionary of them.
 
     Raises:
         DamageError: it is another table.
@@ -55,10 +66,14 @@ def read_csv(path: Path, columns: Columns, sha256: str | None = None) -> list[tu
         )
     try:
         header, *rows = csv.reader(io.StringIO(raw.decode(), newline=""), strict=True)
-        if header != [*columns]:
+        count, others = len(columns), header[len(columns) :]
+        if header[:count] != [*columns] or (others and further is None):
             raise ValueError
-        cells = columns.values()
-        return [tuple(kind(c) for kind, c in zip(cells, row, strict=True)) for row in rows]
+        kinds = [*columns.values(), *[further or str] * len(others)]
+        cells = [tuple(k(cell) for k, cell in zip(kinds, row, strict=True)) for row in rows]
+        if further is None:
+            return cells
+        return [(*row[:count], dict(zip(others, row[count:], strict=True))) for row in cells]
     except (ValueError, csv.Error):
         raise DamageError(f"{path} is damaged or cut short") from None
 

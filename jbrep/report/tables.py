@@ -36,11 +36,6 @@ class Tables(NamedTuple):
     analysis: Analysis | None  # None where runs allow no statistics
     left_out: list[str]  # what there are no statistics of, and why
 
-    @property
-    def title(self) -> str:
-        """What the study's file calls it, or else the folder."""
-        return (self.record.study.title if self.record.study else "") or self.name
-
 
 def check_tables(folder: Path) -> None:
     """Make sure that a folder has the tables of a study."""

@@ -174,7 +174,7 @@ def standing(
         is_open: whether the run leaves open how far apart evaluations are.
     """
     record = read_run(folder) if exists(folder / RUN) else None
-    header = read_header(folder)
+    header = None if record and not record.settings.differing(wanted) else read_header(folder)
     latest = header or record
     if latest is None:
         return Standing(wanted)

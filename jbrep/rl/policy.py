@@ -5,8 +5,7 @@ from typing import Any
 
 from jbrep.encoders import find, load
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.code import make
-from jbrep.encoders.encoder import as_file
+from jbrep.encoders.shipped import make
 from jbrep.errors import InputError, differences
 from jbrep.records.container import without
 from jbrep.records.record import to_plain
@@ -83,7 +82,7 @@ def _untrained(folder: Path, settings: RunSettings, given: Any) -> Trained:
         if given is None:
             encoder = run_encoder(folder, settings)
         else:
-            encoder = as_file(find(given, settings.environment))
+            encoder = find(given, settings.environment)
     return build(settings, encoder, folder)
 
 

@@ -8,7 +8,6 @@ from msgspec import UNSET
 
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import as_file
 from jbrep.envs.description import as_task
 from jbrep.envs.names import is_code
 from jbrep.envs.task import Task
@@ -75,9 +74,9 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
         return cls(task=as_task(task), learner=learner, **others)
 
     def find_encoder(self) -> BaseEncoder:
-        """The encoder; a user's torch module as the file that is kept of it, if it can be."""
+        """The encoder."""
         with single_torch_thread():  # as in training, so that a module computes the same bits
-            return as_file(find(self.encoder, self.task))
+            return find(self.encoder, self.task)
 
     def settings(self, encoder: BaseEncoder) -> RunSettings:
         """All settings that two equal runs share.

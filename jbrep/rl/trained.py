@@ -66,7 +66,7 @@ class Trained(NamedTuple):
         """The same with an encoder in torch, in one episode at a time."""
         encode = self.encoder.encode
         preprocess = preprocessor(
-            lambda row: encode(torch.from_numpy(row)).numpy(), self.statistics
+            lambda row: np.asarray(encode(torch.from_numpy(row))), self.statistics
         )
         return self._held(deterministic_actor(self.policy, self.task, preprocess, batch_size=1))
 

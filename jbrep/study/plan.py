@@ -6,6 +6,7 @@ from functools import cached_property
 from itertools import product
 from pathlib import Path
 
+from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.envs.description import describe
@@ -159,7 +160,7 @@ class Plan:
             for task in self.study.tasks
         }
         there = sorted(folder for folder in folders if exists(folder / MANIFEST))
-        return {str(folder): read_manifest(folder).fingerprint for folder in there}
+        return {str(folder): Dataset(folder).fingerprint for folder in there}
 
     def deviations(self, runs: Collection[RunRecord]) -> list[str]:
         """How what ran differs from what was registered, in sentences; none if nothing was."""

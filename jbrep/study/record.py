@@ -252,8 +252,8 @@ def _encoder(folder: Path, run: RunRecord) -> EncoderFacts:
         kind=encoder.kind,
         size=encoder.size,
         latent_size=encoder.latent_size,
-        encoder=tuple((len(layer.bias), layer.activation) for layer in encoder.encoder),
-        decoder=tuple((len(layer.bias), layer.activation) for layer in encoder.decoder),
+        encoder=tuple((layer.units, layer.activation) for layer in encoder.encoder),
+        decoder=tuple((layer.units, layer.activation) for layer in encoder.decoder),
         **{name: getattr(encoder.header, name) for name in ("training", "data", "metrics")},
     )
 

@@ -29,7 +29,7 @@ from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.curves import common_grid
 from jbrep.stats.runs import groups
 from jbrep.stats.scale import BLIND, best_blind
-from jbrep.study.plan import STUDY, read_plan
+from jbrep.study.plan import STUDY, Plan
 from jbrep.study.record import RECORD, LabelSettings, RunFacts, RunsRecord, runs_record
 from jbrep.study.tables import (
     REFERENCE_RETURNS,
@@ -40,6 +40,7 @@ from jbrep.study.tables import (
     RunInfo,
     by_run,
     former_record,
+    hash_of_references,
     read_references,
     table_hashes,
     write_references,
@@ -58,11 +59,8 @@ def write_tables(folder: Path) -> list[Path]:
     Returns:
         The files: every return, what was run, what `info` told, the returns of reference policies.
     """
-    ended, former = _ended(folder), former_record(folder)
-    before, played_on = (former.tables, former.tasks) if former else ({}, {})
-    plan = read_plan(folder)
-    top = plan.study.verdicts.reference if plan else ""
-    references = write_references(_tasks(ended.values()), folder, before, played_on, top)
+    ended, before = _ended(folder), table_hashes(folder)
+    references = hash_of_references(folder, before)
     rows, infos = list(_returns(ended)), list(_of_runs(ended, read_infos))
     tables = {name: before[name] for name in (DIAGNOSTICS,) if name in before}
     tables[RETURNS] = write_rows(folder / RETURNS, rows, Return)
@@ -73,6 +71,16 @@ def write_tables(folder: Path) -> list[Path]:
     runs_record(folder, ended, tables).write(folder / RECORD)  # last: it says what they are
     names = dict.fromkeys((RETURNS, RECORD, *tables))
     return [folder / name for name in names if name != DIAGNOSTICS]
+
+
+def play_references(plan: Plan) -> None:
+    """Play the policies that a study's runs are compared with, on the starts of their ends."""
+    ended, former = map(read_run, runs_below(plan.folder)), former_record(plan.folder)
+    before, played_on = (former.tables, former.tasks) if former else ({}, {})
+    top = plan.study.verdicts.reference
+    sha256 = write_references(_tasks(ended), plan.folder, before, played_on, top)
+    if former and sha256 and before.get(REFERENCE_RETURNS) != sha256:
+        former.replace(tables={**before, REFERENCE_RETURNS: sha256}).write(plan.folder / RECORD)
 
 
 def found(
@@ -221,7 +229,7 @@ def _prevented(record: RunsRecord, references: References) -> dict[str, str]:
     }
     return {
         task: f"what {listed(policies)} would return isn't known, by which returns are scored: "
-        f"make the report where {task} is installed"
+        "jbrep study plays them when it runs"
         for task, policies in unknown.items()
         if policies
     }

@@ -29,6 +29,7 @@ from jbrep.study.registration import (
     find_committed,
     registration_in,
 )
+from jbrep.study.results import play_references
 from jbrep.study.tables import REFERENCE_RETURNS
 from jbrep.study.work import CRASHED, Outcome, read_progress, say, work
 from jbrep.text import duration
@@ -119,7 +120,8 @@ def run_study(
 
     A study with claims is registered first: beside its file, in a commit, where git has that file.
 
-    `jbrep.study.results.write_tables` then writes what came of it.
+    At last the policies play that agents are compared with. `jbrep.study.results.write_tables` then
+    writes what came of it.
 
     Args:
         plan: the study.
@@ -144,12 +146,12 @@ def run_study(
             if standing_of(plan.run(cell), plan.folder_of(cell)).ended:
                 drop_checkpoint(plan.folder_of(cell))  # it was killed at the very end
         plan.write()  # not before: a study that is refused changes nothing
-        if not unfinished:
-            return 0
         progress = Progress(plan, unfinished)
-        with progress.live, closing(backend(plan, unfinished, workers)) as outcomes:
-            for outcome in outcomes:
-                progress.report(outcome)
+        if unfinished:
+            with progress.live, closing(backend(plan, unfinished, workers)) as outcomes:
+                for outcome in outcomes:
+                    progress.report(outcome)
+        play_references(plan)
     return progress.counts[CRASHED]
 
 

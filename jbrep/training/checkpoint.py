@@ -20,13 +20,7 @@ class _Header(Record, frozen=True, kw_only=True):
 
 
 def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
-    """Write the trainer's state, whole or not at all.
-
-    Args:
-        trainer: after at least one epoch.
-        identity: what must be equal for training to resume; plain JSON.
-        path: the file.
-    """
+    """Write a trainer's state after an epoch, with what must be equal to resume it, plain JSON."""
     tensors = {name: tensor.cpu().numpy() for name, tensor in _state(trainer).items()}
     header = _Header(identity=dict(identity), history=tuple(trainer.history))
     container.write(path, tensors, to_plain(header))

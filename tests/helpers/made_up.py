@@ -10,7 +10,7 @@ from jbrep.encoders import find, save
 from jbrep.encoders.vec_env import agent_spaces
 from jbrep.records import container
 from jbrep.records.tables import write_rows
-from jbrep.report.figures.style import PAPER
+from jbrep.report.figures.panels import PAPER
 from jbrep.rl.agent import Spaces, make_agent, parameters
 from jbrep.rl.checkpoint import Header
 from jbrep.rl.files import (
@@ -84,9 +84,9 @@ def returns_of(runs):
     ]
 
 
-def drawn(plot, style=PAPER):
-    with mpl.rc_context(style):
-        return plot.draw()
+def drawn(plot):
+    with mpl.rc_context(PAPER):
+        return plot.draw(plot.rows)
 
 
 def make_runs(plan, seeds):

@@ -23,7 +23,6 @@ from jbrep.cli import main
 from jbrep.collect import collect
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export, open_source
-from jbrep.dataset.manifest import read_manifest
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.envs.names import environment_versions
@@ -184,7 +183,7 @@ def _import(to, path, options=(), **how):
         command("data", "import", path, *options, "--out", folder / "it")
 
     def result(folder):
-        return read_manifest(folder / "it").fingerprint
+        return Dataset(folder / "it").fingerprint
 
     def copied(folder):
         """What is damaged is a copy."""
@@ -210,9 +209,10 @@ def _import(to, path, options=(), **how):
         finally:
             left = [each.name for each in out.parent.iterdir()]
             assert left in ([], ["it"]), left
-        manifest = read_manifest(out)
+        dataset = Dataset(out)
+        found = dataset.fingerprint, dataset.manifest.settings.as_json()
         shutil.rmtree(out)
-        return manifest.fingerprint, manifest.settings.as_json()
+        return found
 
     return Surface(act, result, files, read, **how)
 
@@ -374,8 +374,5 @@ SURFACES = {  # by name, what makes them of `Shared`
     "inspect": lambda shared: _of_a_run(shared.run, "inspect run --out it.rrd", "it.rrd", _rows),
     "render": lambda shared: _of_a_run(
         shared.run, "render run --size 64x64 --out it.gif", "it.gif"
-    ),
-    "behaviour": lambda shared: _of_a_run(
-        shared.run, "behaviour run --episodes 1 --out it", "it/*"
     ),
 }

@@ -303,7 +303,7 @@ def _create(dataset: Dataset, name: str, spec: EnvSpec | None) -> None:
         observation_space=spaces.Box(-np.inf, np.inf, (task.size,), np.float32),
         action_space=spaces.Box(low, high, dtype=np.float32),
         algorithm_name=settings.policy["kind"],
-        description=f"{json.dumps(settings.as_json())} {dataset.manifest.fingerprint}",
+        description=f"{json.dumps(settings.as_json())} {dataset.fingerprint}",
         requirements=[f"{package}=={versions[package]}" for package in ("jbrep", "mujoco")],
     )
 
