@@ -31,7 +31,6 @@ EXTRAS = {  # what each extra is for; the empty name stands for the core
 _DISTRIBUTIONS = {  # that are called otherwise than the module they bring
     "PIL": "pillow",
     "rerun": "rerun-sdk",
-    "skdim": "scikit-dimension",
     "sklearn": "scikit-learn",
 }
 _RENDER = """

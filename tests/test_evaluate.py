@@ -4,7 +4,6 @@ import json
 import re
 import tracemalloc
 from pathlib import Path
-from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -14,7 +13,6 @@ from sklearn.decomposition import PCA
 from sklearn.linear_model import Ridge
 from sklearn.metrics import r2_score
 from sklearn.preprocessing import StandardScaler
-from threadpoolctl import threadpool_limits
 from wide import make_feature, make_task, wide
 
 from jbrep.dataset import ScaledDataset, Scaler
@@ -27,17 +25,10 @@ from jbrep.evaluate import diagnose, diagnosis
 from jbrep.evaluate.diagnosis import seen, write
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.held_out import MAX_NUMBERS, HeldOut, sample_rows
-from jbrep.evaluate.readout import (
-    correlation,
-    dynamics,
-    intrinsic_dimension,
-    latent_units,
-    neighbours,
-    probes,
-)
-from jbrep.evaluate.reconstruction import NOISES, corruption, reconstruction
+from jbrep.evaluate.readout import dynamics, latent_units, probes, quantities
+from jbrep.evaluate.reconstruction import reconstruction
+from jbrep.evaluate.registry import Judged
 from jbrep.evaluate.regression import ridge
-from jbrep.evaluate.truth import quantities, state
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.controls import Random
 from jbrep.methods.linear import principal_code
@@ -116,9 +107,10 @@ def test_sums_by_episode():
 
 
 def test_held_out_rows_know_their_episodes(held_out):
-    assert len(held_out) == 3
     episode = held_out.data.dataset["episode"][held_out.data.test]
-    np.testing.assert_array_equal(held_out.numbers[held_out.place(held_out.data.test)], episode)
+    assert held_out.numbers.tolist() == np.unique(episode).tolist()
+    (counts,) = held_out.sums(held_out.data.test, np.ones((len(episode), 1)))
+    assert counts.ravel().tolist() == [1000, 1000, 1000]
     followed = held_out.followed(held_out.data.test)
     steps = held_out.data.dataset["step"]
     np.testing.assert_array_equal(steps[followed + 1], steps[followed] + 1)
@@ -128,17 +120,12 @@ def test_held_out_rows_know_their_episodes(held_out):
 def test_of_very_many_episodes_groups_are_resampled():
     lengths = np.random.default_rng(0).integers(1, 4, 12_000)
     it = HeldOut(wide(lengths.tolist(), features=4))
-    rows = it.data.test
-    assert len(it) == 2400
-    assert it.num_groups == 1000
-    place = [it.place(rows[part]) for part in it.slices(rows)]
-    assert {len(np.unique(episodes)) for episodes in place} == {2, 3}
-    np.testing.assert_array_equal(np.concatenate(place), it.place(rows))
-    assert it.row_counts.ravel().tolist() == [len(episodes) for episodes in place]
-    worst = reconstruction(make(it.data, principal_code(it.data, 1)), it).worst_episodes
-    errors = [episode.mse for episode in worst]
-    assert errors == sorted(errors, reverse=True)
-    assert all(lengths[episode.episode] for episode in worst)
+    episode = np.repeat(np.arange(12_000), lengths)[it.data.test]
+    begins = np.diff(episode, prepend=-1) != 0
+    (count,) = it.sums(it.data.test, begins[:, None].astype(float))
+    assert len(it.numbers) == 2400
+    assert len(count) == 1000
+    assert {*count.ravel()} == {2, 3}  # whole episodes
 
 
 def test_sums_of_parts_are_those_of_the_whole(held_out):
@@ -148,13 +135,6 @@ def test_sums_of_parts_are_those_of_the_whole(held_out):
     whole = held_out.sums(rows, values, values[:, :3])
     for ours, theirs in zip(held_out.sums_of_parts(rows, parts), whole, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12)
-
-
-def test_a_sample_of_wide_rows_is_smaller():
-    rows = np.arange(10**6)
-    assert len(sample_rows(rows, 10**5, 22)) == 10**5
-    assert len(sample_rows(rows, 10**5, 348)) == MAX_NUMBERS // 348
-    assert len(sample_rows(rows, 10**5, 10**9)) == 2
 
 
 def test_all_held_out_rows_are_judged_in_little_memory(tmp_path, monkeypatch):
@@ -193,14 +173,6 @@ def test_errors_are_those_of_encode_and_decode(held_out, coder):
         assert feature.rmse_physical[0] == pytest.approx(rmse, rel=1e-4)
         r2 = r2_score(rows[:, i].astype(float), rows[:, i] + lost[:, i])
         assert feature.r2[0] == pytest.approx(r2, rel=1e-3, abs=1e-4)
-    by_row = (scaled**2).mean(axis=1)
-    assert result.quantiles["0.9"] == pytest.approx(np.quantile(by_row, 0.9), rel=1e-3)
-    assert result.quantiles["1"] == pytest.approx(by_row.max(), rel=1e-3)
-    worst = result.worst_episodes[0]
-    errors = by_row.reshape(3, 1000).mean(axis=1)
-    assert worst.episode == held_out.numbers[errors.argmax()]
-    assert worst.mse == pytest.approx(errors.max(), rel=1e-4)
-    assert worst.seed == held_out.data.dataset.episodes["seed"][worst.episode]
 
 
 def test_pca_is_its_own_reference_and_the_full_observation_loses_nothing(
@@ -225,18 +197,7 @@ def test_errors_are_scaled_by_the_data_not_by_the_encoder(held_out, coder):
     assert reconstruction(shifted, held_out).mse[0] == pytest.approx(expected, rel=1e-3)
 
 
-def test_corruption_of_the_full_observation_stays_and_the_linear_denoiser_is_better(
-    data, everything
-):
-    levels = corruption(everything, HeldOut(train_as_test(data)))
-    assert [level.noise for level in levels] == list(NOISES)
-    for level in levels[1:]:
-        assert level.mse[0] == pytest.approx(level.noise**2, rel=0.03)
-        assert level.input_mse == level.noise**2
-        assert level.linear_mse[0] < level.mse[0]
-
-
-def test_dead_and_saturated_units_are_found(held_out):
+def test_dead_units_are_found(held_out):
     weight = np.zeros((4, 16), np.float32)
     weight[0, 14], weight[1, 13], weight[3, 13] = 1, 50, 0.001
     parts = (
@@ -245,10 +206,6 @@ def test_dead_and_saturated_units_are_found(held_out):
     )
     result = latent_units(make(held_out.data, parts), held_out)
     assert result.dead == (2, 3)
-    assert result.saturation[1] > 0.9
-    assert result.saturation[0] == 0
-    assert result.correlation[2] == (None,) * 4
-    assert result.correlation[0][0] == pytest.approx(1)
     assert 1 < result.participation_ratio < 2
 
 
@@ -261,7 +218,6 @@ def test_the_participation_ratio_counts_equal_variances(held_out):
     result = latent_units(make(data, (whitened, back)), HeldOut(train_as_test(data)))
     assert result.participation_ratio == pytest.approx(5, rel=1e-3)
     np.testing.assert_allclose(result.variance, 1, rtol=1e-3)
-    assert result.saturation is None
 
 
 def train_as_test(data):
@@ -270,18 +226,6 @@ def train_as_test(data):
     other.train = other.test = data.train
     other.scaler = data.scaler
     return other
-
-
-def test_intrinsic_dimensions_of_what_is_known():
-    random = np.random.default_rng(0)
-    plane = random.normal(size=(3000, 3)) @ random.normal(size=(3, 10))
-    estimated = intrinsic_dimension(plane)
-    assert (estimated.two_nn, estimated.mle) == pytest.approx((3, 3), abs=0.3)
-    angle = random.uniform(0, 2 * np.pi, 3000)
-    circle = np.stack((np.cos(angle), np.sin(angle)), axis=1)
-    estimated = intrinsic_dimension(circle)
-    assert (estimated.two_nn, estimated.mle) == pytest.approx((1, 1), abs=0.1)
-    assert intrinsic_dimension(np.zeros((3000, 4))).mle is None
 
 
 def test_quantities_are_those_of_the_simulated_body():
@@ -303,11 +247,6 @@ def test_quantities_are_those_of_the_simulated_body():
         bearing = np.arctan2(*result["bearing_of_target"][i][::-1])
         assert bearing == pytest.approx(np.arctan2(left, ahead))
         np.testing.assert_allclose(result["angle_to_target"][i], (np.cos(row[18]), np.sin(row[18])))
-    names = list(state(task, rows))
-    assert names[:3] == ["heading_cos", "heading_sin", "uprightness"]
-    assert "orientation_w" not in names
-    assert "motor_angle" not in names
-    assert {"position_x", "motor_velocity", "target_z"} <= set(names)
 
 
 def test_every_task_has_its_quantities():
@@ -331,27 +270,17 @@ def test_any_other_robots_truth_is_every_feature():
     assert list(result) == ["height", "yaw", "turns", "knee", "unknown"]
     np.testing.assert_array_equal(result["turns"], rows[:, 2:3])
     np.testing.assert_allclose(result["yaw"], np.stack((np.cos(rows[:, 1]), np.sin(rows[:, 1])), 1))
-    columns = state(robot, rows)
-    assert list(columns) == ["height", "yaw_cos", "yaw_sin", "turns", "knee", "unknown"]
-    np.testing.assert_array_equal(columns["knee"], rows[:, 3])
 
 
-def test_a_wide_robot_can_be_judged(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.evaluate.readout.MAX_NUMBERS", 1 << 19)
+def test_a_wide_robot_can_be_judged(tmp_path):
+    rows = np.arange(10**6)
+    assert len(sample_rows(rows, 10**5, 22)) == 10**5
+    assert len(sample_rows(rows, 10**5, 348)) == MAX_NUMBERS // 348
     data = wide([1, 300, 2, 1, 250, 99, 1, 180], features=70)
     evaluation = write({"r-20": make(data, projection(data, 20, 0))}, data, tmp_path)
-    everything, ours = evaluation.encoders.values()
-    for result in everything, ours:
-        gtc = result.correlation
-        assert gtc.state_dimensions == 70
-        assert len(gtc.dimensions) == 2 * (1 << 19) // (1000 * 70)
+    for result in evaluation.encoders.values():
         assert set(result.probes["obs_0"]) == {None}  # it is constant
-    assert gtc.dimensions.keys() == everything.correlation.dimensions.keys()
-    assert all(everything.probes[f"obs_{i}"][0] > 0.8 for i in range(1, 70))
-    shown = evaluation_text(evaluation, 100)
-    assert "What each lacks can't be said: " in shown
     shown = evaluation_text(evaluation, 100, everything=True)
-    assert "14 of its 70 dimensions" in " ".join(shown.split())
     assert re.search(r"probes, mean +worst probe", shown)
     assert max(map(len, shown.splitlines())) <= 100
 
@@ -360,7 +289,7 @@ def test_episodes_of_one_row_have_no_dynamics(tmp_path):
     data = wide([1] * 20, features=6)
     result = write({"r-2": make(data, projection(data, 2, 0))}, data, tmp_path)
     for judged in result.encoders.values():
-        assert {judged.dynamics.linear, judged.dynamics.change} == {(None, None, None)}
+        assert {judged.scores[name] for name in ("next", "change")} == {(None, None, None)}
         assert judged.reconstruction.mse[0] is not None
     assert " nan" not in evaluation_text(result)
 
@@ -394,6 +323,11 @@ def test_a_unit_that_is_rounding_where_a_regression_is_fitted_does_not_outweigh_
     assert np.abs(ridge(values, wanted)(unseen) - expected).max() < 2
 
 
+def judged(encoder, held_out):
+    """Of which nothing else is known."""
+    return Judged(encoder, held_out, None, None, None)
+
+
 def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     dataset = held_out.data.dataset
     parts, changes = [], []
@@ -412,16 +346,16 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     known, unseen = (np.column_stack((whiten(v[:, :4]), v[:, 4])) for v in (known, unseen))
     scaler = StandardScaler().fit(known)
     predicted = Ridge(1.0).fit(scaler.transform(known), after).predict(scaler.transform(unseen))
-    result = dynamics(coder, held_out)
+    linear, persistence, change = dynamics(judged(coder, held_out))
     expected = r2_score(true, predicted, multioutput="variance_weighted")
-    assert result.linear[0] == pytest.approx(expected, abs=1e-3)
+    assert linear[0] == pytest.approx(expected, abs=1e-3)
     still = r2_score(true, unseen[:, :4], multioutput="variance_weighted")
-    assert result.persistence[0] == pytest.approx(still, abs=1e-3)
-    assert result.linear[0] > result.persistence[0]
+    assert persistence[0] == pytest.approx(still, abs=1e-3)
+    assert linear[0] > persistence[0]
     fitted = Ridge(1.0).fit(scaler.transform(known), changes[0] / changes[0].std(axis=0))
     predicted, true = fitted.predict(scaler.transform(unseen)), changes[1] / changes[0].std(axis=0)
     expected = r2_score(true, predicted, multioutput="variance_weighted")
-    assert result.change[0] == pytest.approx(expected, abs=1e-3)
+    assert change[0] == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -438,55 +372,9 @@ def test_units_mixed_or_scaled_do_not_change_how_well_the_next_is_read(held_out,
     weight, bias = ((mixed @ each).astype(np.float32) for each in (layer.weight, layer.bias))
     turned = (layer._replace(weight=weight, bias=bias),)
     other = Encoder(coder.header, coder.scaler, turned, coder.decoder)
-    one, two = dynamics(coder, held_out), dynamics(other, held_out)
-    for name in ("linear", "persistence", "change"):
-        assert getattr(one, name) == pytest.approx(getattr(two, name), abs=1e-3)
-
-
-def test_neighbours_come_from_training_episodes(held_out, coder, everything):
-    data = held_out.data
-    test, train = observed(held_out, "test"), observed(held_out, "train")
-    wanted, true = (np.stack(list(state(data.task, o).values()), 1) for o in (test, train))
-    apart = coder.encode(test)[:, None] - coder.encode(train)[None]
-    nearest = np.argsort((apart**2).sum(axis=-1), axis=1)[:, :5]
-    expected = (((true[nearest] - wanted[:, None]) / true.std(axis=0)) ** 2).mean()
-    result = neighbours(coder, held_out)
-    assert result.mse[0] == pytest.approx(expected, rel=1e-2)
-    assert np.mean([v[0] for v in result.dimensions.values()]) == pytest.approx(result.mse[0])
-    assert neighbours(everything, held_out).mse[0] < result.mse[0]
-
-
-def test_neighbours_that_are_equally_near_are_the_same_on_any_number_of_threads(data, monkeypatch):
-    signs = SimpleNamespace(encode=lambda rows: np.sign(rows).astype(np.float32))
-    encoder, held_out = find(signs, data.task), HeldOut(data)
-    monkeypatch.setenv("OMP_NUM_THREADS", "8")  # or no more are taken than there are cores
-    found = []
-    for threads in (1, 8):
-        with threadpool_limits(threads, "openmp"):
-            found.append(neighbours(encoder, held_out).mse)
-    assert found[0] == found[1]
-
-
-def test_correlation_takes_units_alone_as_candidates(held_out, coder, everything):
-    rows = observed(held_out, "test")
-    truth = state(held_out.data.task, rows)
-    latents = coder.encode(rows)
-    result = correlation(coder, held_out)
-    for name, values in truth.items():
-        expected = max(abs(np.corrcoef(unit, values)[0, 1]) for unit in latents.T)
-        assert result.dimensions[name][0] == pytest.approx(expected, abs=1e-4)
-    shown = correlation(everything, held_out).dimensions
-    assert shown["motor_velocity"][0] == pytest.approx(1)
-    assert shown["uprightness"][0] < 0.99  # though other dimensions of the state are related
-
-
-def test_a_dimension_that_does_not_vary_has_no_correlation():
-    held_out = HeldOut(wide([50] * 10, features=4))  # the first feature is constant
-    gtc = correlation(make(held_out.data, ((), ())), held_out)
-    assert gtc.dimensions["obs_0"] == (None,) * 3
-    assert gtc.mean == pytest.approx((1, 1, 1))
-    held_out.data.dataset.arrays["observation"][:] = 1
-    assert correlation(make(held_out.data, ((), ())), held_out).mean == (None,) * 3
+    both = (dynamics(judged(each, held_out)) for each in (coder, other))
+    for one, two in zip(*both, strict=True):
+        assert one == pytest.approx(two, abs=1e-3)
 
 
 def still(units, weight=0.0):
@@ -502,8 +390,6 @@ def still(units, weight=0.0):
 @pytest.mark.parametrize("parts", [still(3), still(3, 1.0), still(1), still(1, 1.0)])
 def test_dead_and_single_units_can_be_judged(held_out, parts, tmp_path):
     result = write({"it": make(held_out.data, parts)}, held_out.data, tmp_path).encoders["it"]
-    gtc = result.correlation
-    assert all(0 <= value[0] <= 1 + 1e-9 for value in gtc.dimensions.values())
     units = len(result.latent_units.variance)
     assert len(result.latent_units.dead) in (units, units - 1)
 
@@ -511,8 +397,7 @@ def test_dead_and_single_units_can_be_judged(held_out, parts, tmp_path):
 def test_the_observation_alone_can_be_judged(held_out, everything, tmp_path):
     evaluation = write({"identity": everything}, held_out.data, tmp_path)
     assert [plot.name for plot in encoder_plots(evaluation)] == [
-        *("prediction_by_feature", "prediction_by_horizon"),
-        *("error_by_feature", "latent_correlation"),
+        *("prediction_by_feature", "prediction_by_horizon", "error_by_feature"),
     ]
 
 
@@ -523,8 +408,7 @@ def test_a_constant_feature_can_be_judged(data):
     flat.scaler = Scaler(*(np.where(is_height, np.float32(0.03), each) for each in bounds))
     result = diagnose({"pca-4": make(flat, principal_code(flat, 4))}, flat).encoders["pca-4"]
     assert set(result.reconstruction.features[2].r2) == {None}
-    error = result.reconstruction.mse[0]
-    assert result.corruption[0].linear_mse[0] == pytest.approx(error, rel=1e-3)
+    assert result.scores["times_pca"].value == pytest.approx(1, rel=1e-3)
 
 
 def still_height(data, rows):
@@ -540,11 +424,8 @@ def test_labels_and_numbers_that_cannot_be_judged(data):
     huge = Layer(np.full((16, 16), 1e11, np.float32), np.zeros(16, np.float32), "linear")
     with pytest.raises(InputError, match="it gives numbers that are not finite"):
         diagnose({"it": make(data, ((), (huge,) * 4))}, data)
-    rows = sample(data.test, 1000)  # that are looked at first
-    scaled = data.scaler.scale(data.dataset["observation"][np.concatenate((rows, data.train))])
-    heights = scaled[:, 2]
-    among_first = heights[: len(rows)].max()
-    assert heights.max() > among_first
+    heights = data.scaler.scale(data.dataset["observation"][data.train])[:, 2]
+    among_first = np.sort(heights)[-2]  # in a single row of those to train on it is more
     weight = np.zeros((16, 16), np.float32)
     weight[0, 2] = 1
     only_above = Layer(weight, np.full(16, -among_first, np.float32), "relu")
@@ -594,11 +475,11 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
     evaluation = read_document(Path("judged", EVALUATION), Evaluation)
     whole = evaluation_text(evaluation, 80, everything=True)
     assert whole.startswith(shown.partition("\n\nJudged")[0])
-    assert "KNN-MSE" in whole
+    assert "R² of the next latent" in whole
     monkeypatch.setattr(diagnosis, "diagnose", lambda *given: evaluation)
     again = jbrep(*command, "--json")
     kept = json.loads(Path("judged", EVALUATION).read_text())
-    assert json.loads(again.stdout) | {"sha256": kept["sha256"]} == kept
+    assert json.loads(again.stdout) == kept
     labels = ["full", "dae-4, shipped", "./dae-4", "full, shipped"]
     assert list(evaluation.encoders) == labels
     assert "dae-4, shipped; ./dae-4; full, shipped" in again.stderr
@@ -608,7 +489,7 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
 
 
 def test_whether_an_encoder_may_have_seen_the_episodes(data):
-    fingerprint = data.dataset.manifest.fingerprint
+    fingerprint = data.dataset.fingerprint
     for source, seed, policy, expected in (
         (fingerprint, 3, {}, "no test row"),
         ("other", 3, {}, "maybe"),

@@ -8,13 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from jbrep.report.figures.curves import every_run
+from jbrep.report.figures.diagnostics import _free
+from jbrep.report.figures.differences import difference_plot
+from jbrep.report.figures.methods import method_plots, timescales
+from jbrep.report.figures.plot import Drawing
+from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, family, styles, with_runs
 from judged import NOTHING, diagnostics, evaluation, prediction
 from made_up import drawn, label_of, returns_of
 from matplotlib.text import Text
 from PIL import Image
 
 from jbrep.envs import describe
-from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import (
     KEPT,
     Evaluation,
@@ -23,15 +28,8 @@ from jbrep.evaluate.evaluation import (
     Reconstruction,
     Score,
 )
-from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, observe
 from jbrep.records.document import read_document
-from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, write
-from jbrep.report.figures.curves import every_run
-from jbrep.report.figures.diagnostics import _free
-from jbrep.report.figures.differences import difference_plot
-from jbrep.report.figures.methods import method_plots, timescales
-from jbrep.report.figures.plot import Drawing
-from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, family, styles, with_runs
+from jbrep.report.figures import encoder_plots, study_plots, write
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
@@ -419,8 +417,7 @@ def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
     encoders = {name: whole.encoders[name] for name in ("full", "dae-12", "dae-8", "pca-8")}
     found = {plot.name: plot for plot in encoder_plots(whole.replace(encoders=encoders))}
     assert list(found) == [
-        *("prediction_by_feature", "prediction_by_horizon"),
-        *("error_by_feature", "error_by_latent", "error_by_corruption", "latent_correlation"),
+        *("prediction_by_feature", "prediction_by_horizon", "error_by_feature", "error_by_latent"),
     ]
     error = encoders["dae-8"].reconstruction.mse
     (row,) = [row for row in found["error_by_latent"].rows if row[0] == "dae-8"]
@@ -429,10 +426,7 @@ def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
     assert any(error.value in container.lines[0].get_ydata() for container in axes.containers)
     assert axes.lines[-1].get_label() == "PCA"
     assert axes.lines[-1].get_marker() == "o"  # as a line, one size alone couldn't be seen
-    matrix = drawn(found["latent_correlation"]).axes[0].images[0].get_array()
-    expected = encoders["dae-12"].latent_units.correlation
-    np.testing.assert_array_equal(matrix, np.array(expected, float))
-    assert len(write(found.values(), tmp_path)) == 6
+    assert len(write(found.values(), tmp_path)) == 4
 
 
 def test_of_a_wide_robot_the_worst_features_are_shown():
@@ -443,12 +437,12 @@ def test_of_a_wide_robot_the_worst_features_are_shown():
         for i, each in enumerate(r2)
     ]
     loses = {"mse": NOTHING, "pca_mse": NOTHING, "ratio_to_pca": None, "features": features}
-    lost = Reconstruction(**loses, quantiles={}, worst_episodes=[])
+    lost = Reconstruction(**loses)
     encoders = {
-        name: diagnostics(348, kind=kind, reconstruction=lost, corruption=[])
+        name: diagnostics(348, kind=kind, reconstruction=lost)
         for name, kind in (("dae-348", "dae"), ("raw", "full"))
     }
-    by_feature, correlations = encoder_plots(evaluation(encoders, "Humanoid-v5"))
+    (by_feature,) = encoder_plots(evaluation(encoders, "Humanoid-v5"))
     assert len(by_feature.rows) == 2 * 348
     assert "Of 348 features the 40 worst are shown; all are in the table." in by_feature.caption
     figure = drawn(by_feature)
@@ -456,9 +450,6 @@ def test_of_a_wide_robot_the_worst_features_are_shown():
     assert names == [f"obs_{i}" for i in range(307, 347)]
     assert "the 40 worst of 348 features" in figure.get_suptitle()
     assert figure.get_figheight() < 8
-    for axes in drawn(correlations).axes[:2]:
-        assert len(axes.get_xticks()) < 20
-        assert not any("obs" in label.get_text() for label in axes.get_xticklabels())
 
 
 def test_diagnostics_stand_against_final_returns(analysis, returns):
@@ -493,67 +484,6 @@ def test_names_stand_where_they_cover_nothing():
     assert None in _free(["a-long-name"] * 5, crowd)
 
 
-@pytest.fixture(scope="module")
-def behaviours():
-    sources = ("constant:drive=0.5", "heuristic")
-    return observe(sources, describe("move_in_direction"), episodes=3, target_yaw=np.pi / 6)[1]
-
-
-def test_a_constant_drive_turns_the_motor_one_way(behaviours):
-    constant, heuristic = behaviours
-    middles = (SPEEDS[1:] + SPEEDS[:-1]) / 2
-    assert constant.motor.sum() == pytest.approx(1)
-    assert constant.motor[middles > 50].sum() > 0.9  # 145 rad/s at full drive
-    assert fast_shares(constant) == pytest.approx(
-        (0, constant.motor[middles > FAST].sum()), abs=1e-12
-    )
-    assert heuristic.motor[middles < -20].sum() > 0.2
-    assert heuristic.motor[middles > 20].sum() > 0.2
-
-
-def test_the_heuristic_goes_where_the_target_points(behaviours):
-    _, heuristic = behaviours
-    assert heuristic.places.sum() == pytest.approx(1)
-    x, y = heuristic.mean_place
-    assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(30, abs=14)
-    middles = (heuristic.edges[1:] + heuristic.edges[:-1]) / 2
-    shares = heuristic.places.sum(axis=1), heuristic.places.sum(axis=0)
-    np.testing.assert_allclose([share @ middles for share in shares], (x, y), atol=0.01)
-    assert len(heuristic.returns) == 3
-
-
-def test_behaviour_is_drawn_from_its_tables(behaviours, tmp_path):
-    motor, places = behaviour_plots("move_in_direction", behaviours, SPEEDS, np.pi / 6)
-    assert len(motor.rows) == 2 * 72
-    axes = drawn(motor).axes[0]
-    np.testing.assert_allclose(axes.patches[0].get_data().values, 100 * behaviours[0].motor)
-    seen = [float(row[3]) for row in places.rows if row[0] == "heuristic"]
-    assert sum(seen) == pytest.approx(1)
-    mesh = drawn(places).axes[1].collections[0].get_array()
-    places_of_heuristic = behaviours[1].places
-    np.testing.assert_array_equal(mesh.filled(0), places_of_heuristic.T)  # y goes up
-    write((motor, places), tmp_path)
-
-
-def test_before_and_after_training_stand_one_above_the_other(behaviours):
-    titles = [f"{name}, {when}" for name in "abc" for when in ("before training", "4 runs")]
-    several = [replace(behaviours[0], name=title) for title in titles]
-    _, places = behaviour_plots("move_in_direction", several, SPEEDS, np.pi / 4)
-    panel = {axes.get_title(loc="left").split("\nreturn")[0]: axes for axes in drawn(places).axes}
-    for name in "abc":
-        above, below = (panel[f"{name}\n{when}"] for when in ("before training", "4 runs"))
-        above, below = (axes.get_subplotspec() for axes in (above, below))
-        assert (above.rowspan.start, below.rowspan.start) == (0, 1)
-        assert above.colspan == below.colspan
-
-
-def test_the_task_of_a_policy_is_needed_and_no_data_set():
-    with pytest.raises(InputError, match="face_direction is a data set: give the folder of a"):
-        observe(("data/sample/face_direction",), None, 1, 0)
-    with pytest.raises(InputError, match="policy heuristic needs a --task"):
-        observe(("heuristic",), None, 1, 0)
-
-
 def scores(quality):
     """How well an encoder predicts, by the steps ahead."""
     three = Score(quality, quality - 0.02, quality + 0.02)
@@ -585,7 +515,7 @@ def of_methods():
 
 def test_methods_and_predictions_have_figures(of_methods):
     assert list(of_methods) == [
-        *("prediction_by_feature", "prediction_by_horizon", "latent_correlation"),
+        *("prediction_by_feature", "prediction_by_horizon"),
         *("spectrum", "timescales", "loss_by_horizon", "losses"),
     ]
 

@@ -1,7 +1,6 @@
 """Recordings hold what they were made from, as Rerun's own reader finds it."""
 
 import json
-import os
 import re
 import signal
 import sys
@@ -17,27 +16,19 @@ from made_up import write_checkpoint, write_record
 from rerun.chunk import RrdReader
 from small import ONE_EACH
 
-from jbrep.dataset import Dataset
 from jbrep.encoders import find
-from jbrep.encoders.base import as_encoder
 from jbrep.envs import describe
 from jbrep.envs.physics import Motion
 from jbrep.errors import InputError
-from jbrep.evaluate.truth import state
 from jbrep.inspection import inspect
 from jbrep.inspection.blueprint import curves_layout
-from jbrep.inspection.directions import name_directions
-from jbrep.inspection.episode import record_episode
-from jbrep.inspection.fan import make_fan
-from jbrep.inspection.forecast import Examples, from_dataset, windows
+from jbrep.inspection.episode import POINTS, SPACING, record_episode, sweep
 from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot, rotate, shapes
 from jbrep.inspection.scene import contacts, shades
 from jbrep.inspection.signals import MOST_LINES, panels, principal_components
-from jbrep.inspection.traversal import POINTS, SPACING, sweep
 from jbrep.play import jitterbug
 from jbrep.play.jitterbug import reward_terms
-from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode
 from jbrep.records.tables import write_rows
 from jbrep.rl import Run
@@ -197,14 +188,14 @@ def test_series_are_the_episodes(entities, rollout):
 
 
 def test_contacts_carry_the_robot(entities, robot, rollout):
-    found = contacts(robot, rollout.motion)
-    lift = found.forces[:, 2].sum() / ROWS
+    counts, points, forces = contacts(robot, rollout.motion)
+    lift = forces[:, 2].sum() / ROWS
     assert lift == pytest.approx(robot.weight, rel=0.1)  # over ten seconds, on the floor
-    assert np.abs(found.points[:, 2]).max() < 3e-3  # [m] half of how far a foot sinks in
-    assert len({*found.counts}) > 1
+    assert np.abs(points[:, 2]).max() < 3e-3  # [m] half of how far a foot sinks in
+    assert len({*counts}) > 1
     sent = entities["/world/contacts"]["Points3D:positions"].to_pylist()
-    assert [*map(len, sent)] == found.counts.tolist()
-    np.testing.assert_allclose(np.concatenate([p for p in sent if p]), found.points, atol=1e-7)
+    assert [*map(len, sent)] == counts.tolist()
+    np.testing.assert_allclose(np.concatenate([p for p in sent if p]), points, atol=1e-7)
 
 
 def test_what_is_decoded(entities, rollout):
@@ -237,22 +228,18 @@ def test_what_is_decoded(entities, rollout):
     shown = values(entities["/world/ghost/jitterbug"], "Boxes3D:colors")[:, 0]
     expected = shades(apart).astype(np.uint32) @ (1 << np.array([24, 16, 8, 0], np.uint32))
     np.testing.assert_array_equal(shown, expected)  # not one for all times, which would win
-    aligned, attitude = poses(entities["/world/aligned/jitterbug"])
-    np.testing.assert_array_equal(aligned, qpos[:, :3].astype(np.float32))
-    np.testing.assert_array_equal(attitude, quaternion)
 
 
 def test_what_is_rigid_is_sent_once(entities, robot):
-    """The decoded robots' legs are at rest: their poses are those of the model's."""
+    """The decoded robot's legs are at rest: their poses are those of the model's."""
     data = mujoco.MjData(robot.model)
     mujoco.mj_kinematics(robot.model, data)
     for body in robot.bodies[1:]:
         name, moves = robot.names[body], robot.names[body] == "weight"
-        for root in ("ghost", "aligned"):
-            own, _ = poses(entities[f"/world/{root}/jitterbug/{name}"])
-            assert len(own) == (ROWS if moves else 1)
-            away = data.xpos[body] - data.xpos[robot.root]
-            np.testing.assert_allclose(own[0], away, atol=1e-7)
+        own, _ = poses(entities[f"/world/ghost/jitterbug/{name}"])
+        assert len(own) == (ROWS if moves else 1)
+        away = data.xpos[body] - data.xpos[robot.root]
+        np.testing.assert_allclose(own[0], away, atol=1e-7)
 
 
 def test_an_encoder_that_keeps_all_gives_the_robot_back(unchanged):
@@ -294,7 +281,7 @@ def test_principal_components():
 @pytest.mark.parametrize("recording", ["recorded", "unchanged", "traversed"])
 def test_recordings_are_small_and_bring_their_layout(recording, request):
     path = request.getfixturevalue(recording)
-    assert path.stat().st_size < 6e6
+    assert path.stat().st_size < 4e6
     (layout,) = RrdReader(path).blueprints()
     assert layout.application_id == "jbrep"
     chunks = [columns(chunk) for chunk in RrdReader(path).stream(store=layout)]
@@ -355,101 +342,6 @@ def test_a_traversal_shows_what_each_unit_decodes_to(traversed, rollout):
         assert len(quaternion) == POINTS
 
 
-@pytest.fixture(scope="module")
-def walk():
-    """Examples of a point that an action pushes: position, velocity, and another number.
-
-    Each episode has its own place, so that a window across the end of one would show.
-    """
-    random = np.random.default_rng(0)
-    observations, actions = [], []
-    for _ in range(6):
-        push = random.uniform(-1, 1, (200, 1))
-        speed = np.zeros(201)
-        for step in range(200):
-            speed[step + 1] = 0.7 * speed[step] + 0.3 * push[step, 0]
-        place = random.uniform(-1000, 1000) + np.concatenate(([0], np.cumsum(speed[:-1])))
-        observations.append(np.stack((place, speed, random.normal(size=201)), axis=1))
-        actions.append(push)
-    return Examples([rows.astype(np.float32) for rows in observations], actions, "walks")
-
-
-@pytest.fixture(scope="module")
-def walker():
-    return describe("Pendulum-v1").replace(action_low=(-1.0,), action_high=(1.0,))
-
-
-@pytest.fixture(scope="module")
-def others(walk):
-    """All but the first, to fit to."""
-    return Examples(walk.observations[1:], walk.actions[1:], "others")
-
-
-def a_walk(walker, examples, stop=200):
-    """The first example as an episode to show."""
-    observation, action = examples.observations[0][: stop + 1], examples.actions[0][:stop]
-    reward = np.zeros(stop, np.float32)
-    return Rollout(walker, "a walk", 0, observation, action, reward, False, True)
-
-
-def test_a_fan_predicts_what_comes_of_actions(walk, others, walker):
-    """Also across episodes' ends nothing would be predicted this well."""
-    fan = make_fan(a_walk(walker, walk), find("full", walker), others)
-    assert fan.names == ["obs_0", "obs_1", "obs_2"]
-    assert (fan.steps, fan.starts[[0, -1]].tolist()) == ([0, 5, 10, 15, 20], [0, 180])
-    np.testing.assert_array_equal(fan.truth[:, 2], walk.observations[0][fan.starts + 10])
-    assert (fan.explained[:, :2] > 0.9).all()
-    assert (fan.explained[:, 2] < 0.6).all()  # of noise only the way back to its mean
-    at = {name: lines[:, 4, 0] - lines[:, 0, 0] for name, lines in fan.lines.items()}
-    assert (at["held_low"] < at["held_midway"]).all()
-    assert (at["held_midway"] < at["held_high"]).all()
-    coasting = fan.truth[:, 0, 1] * (1 - 0.7**20) / 0.3
-    np.testing.assert_allclose(at["held_high"] - coasting, 20 - (1 - 0.7**20) / 0.3, atol=2)
-
-
-def test_a_fan_knows_nothing_of_later_states_and_actions(walk, others, walker):
-    """What comes later may be anything; the lines stay."""
-    full, changed = find("full", walker), walk.observations[0].copy()
-    changed[101:] += 1e3
-    pushed = walk.actions[0].copy()
-    pushed[110:] = 1.0
-    told = make_fan(a_walk(walker, walk), full, others)
-    poisoned = a_walk(walker, Examples([changed], [pushed], ""))
-    again = make_fan(poisoned, full, others)
-    start = 20
-    assert told.starts[start] == 100
-    for name, lines in told.lines.items():
-        for place, ahead in enumerate(told.steps):
-            same = np.array_equal(lines[start, place], again.lines[name][start, place])
-            assert same == (name != "taken" or ahead <= 10), (name, ahead)
-
-
-def test_windows_stay_in_their_part_and_leave_out_turns():
-    task = describe("face_direction")
-    place = task.feature_names.index("angle_to_target")
-    observation = np.zeros((8, task.size))
-    observation[:, place] = [0, 1, 2, 3, -3, -2, -1, 0]
-    latent, action = np.arange(8.0)[:, None], np.arange(10.0, 17)[:, None]
-    inputs, change = windows(latent, action, observation, task, 2)
-    np.testing.assert_array_equal(inputs, [[0, 10, 11], [1, 11, 12], [4, 14, 15], [5, 15, 16]])
-    np.testing.assert_array_equal(change, np.full((4, 1), 2))
-
-
-def test_a_code_that_cannot_decode_is_read_by_regression(walk, others, walker):
-    halved = as_encoder(lambda rows: rows[:, :2] / 2, walker)
-    fan = make_fan(a_walk(walker, walk), halved, others)
-    now = fan.lines["taken"][:, 0, :2]
-    np.testing.assert_allclose(now, fan.truth[:, 0, :2], rtol=5e-3, atol=1e-3)
-    assert fan.explained[3, 0] > 0.9
-
-
-def test_a_fan_of_symmetry_goes_out_from_where_the_robot_stands(rollout):
-    """It is drawn in the world, though the code doesn't tell where the robot is."""
-    examples = Examples([rollout.observation], [rollout.action], "this same episode")
-    fan = make_fan(rollout, find("symmetry", rollout.task), examples)
-    np.testing.assert_allclose(fan.lines["taken"][:, 0], fan.truth[:, 0], atol=2e-3)
-
-
 def test_coordinates_give_back_all_but_the_sign_of_a_quaternion(rollout, tmp_path):
     turned = rollout.observation.copy()
     turned[:, rollout.task.groups["orientation"]] *= -1
@@ -457,97 +349,6 @@ def test_coordinates_give_back_all_but_the_sign_of_a_quaternion(rollout, tmp_pat
     record_episode(other, tmp_path / "a.rrd", find("coordinates", rollout.task))
     error = scalars(read(tmp_path / "a.rrd")["/error/total"])
     assert np.abs(error).max() < 1e-3
-
-
-def test_too_little_to_predict_from(walk, walker):
-    full = find("full", walker)
-    few = Examples(walk.observations[:1], walk.actions[:1], "")
-    assert make_fan(a_walk(walker, walk, stop=4), full, few) is None
-    short = make_fan(a_walk(walker, walk, stop=12), full, few)
-    assert short.steps == [0, 5, 10]
-    tiny = Examples([walk.observations[0][:20]], [walk.actions[0][:19]], "")
-    assert make_fan(a_walk(walker, walk), full, tiny) is None
-
-
-def test_directions_are_named_by_what_they_follow():
-    """A code that mixes a slow angle, a fast number and a copy of it that adds nothing."""
-    task = describe("Pendulum-v1")
-    random = np.random.default_rng(0)
-    pieces = []
-    for _ in range(60):
-        slow = np.sin(np.arange(40) / 40 + random.uniform(0, 2 * np.pi))
-        pieces.append(np.stack((slow, random.normal(size=40), random.normal(size=40)), axis=1))
-    examples = Examples([rows.astype(np.float32) for rows in pieces], [], "")
-    mix = np.array([[-1.0, 5], [2, 3], [2, 3]], np.float32).T  # of obs_0 and obs_2
-    encoder = as_encoder(lambda rows: rows[:, [0, 2]] @ mix, task)
-    named = name_directions(encoder, task, examples)
-    assert [label[:13] for label in named.labels] == ["slow 1: obs 0", "fast 2: obs 2"]
-    assert all(re.search(r", r = (1\.00|0\.99)$", label) for label in named.labels)
-    slowness = np.concatenate([rows[:, 0] for rows in pieces])
-    along = named(np.concatenate(pieces)[:, [0, 2]] @ mix)
-    assert np.corrcoef(along[:, 0], slowness)[0, 1] > 0.99
-    np.testing.assert_allclose(np.cov(along.T), np.eye(2), atol=0.1)
-    assert named.autocorrelation[0] == pytest.approx(np.cos(10 / 40), abs=0.03)
-    constant = as_encoder(lambda rows: 0 * rows[:, :1], task)
-    assert name_directions(constant, task, examples) is None
-
-
-def test_examples_are_training_episodes_but_the_one_shown():
-    data = Dataset(FACE)
-    numbers = np.unique(data["episode"][data.split().train]).tolist()
-    for shown in (None, numbers[0]):
-        chosen = [number for number in numbers if number != shown]
-        examples = from_dataset(data, shown)
-        assert len(examples.observations) == len(chosen)
-        for i, number in enumerate(chosen):
-            episode = data.episode(number)
-            np.testing.assert_array_equal(examples.observations[i], episode["observation"])
-            np.testing.assert_array_equal(examples.actions[i], episode["action"][:-1])
-
-
-def test_forecasts_and_directions_are_recorded(entities, rollout, recorded):
-    task, fan_at = rollout.task, entities["/world/fan/truth"]
-    path = values(fan_at, "LineStrips3D:strips")[:, 0]
-    np.testing.assert_array_equal(fan_at["step"].to_numpy(), np.arange(0, 981, 5))
-    position = rollout.observation[:, :3]
-    for number, ahead in enumerate((0, 5, 10, 15, 20)):
-        np.testing.assert_array_equal(path[:, number], position[ahead : ahead + 981 : 5])
-    decoded = scalars(entities["/reconstruction/position"])[:981:5]
-    for name in ("taken", "held_low", "held_midway", "held_high"):
-        lines = values(entities[f"/world/fan/{name}"], "LineStrips3D:strips")[:, 0]
-        np.testing.assert_allclose(lines[:, 0], decoded, atol=1e-6)
-    series = entities["/forecast/heading_cos/ahead"]
-    assert names(series)[:2] == ["heading cos, taken", "heading cos, held low"]
-    assert series["step"].to_pylist()[:7] == [0, 5, 10, 15, 20, 20, 25]
-    assert series["step"].to_pylist()[-1] <= len(rollout)
-    assert np.isnan(scalars(series)[5]).all()
-    true = state(task, rollout.observation)["heading_cos"]
-    np.testing.assert_allclose(scalars(entities["/forecast/heading_cos/truth"])[:, 0], true)
-    told = text(entities["/provenance"])
-    assert f"Forecasts are fitted to 2 training episodes of {FACE}." in told
-    assert "| heading cos | " in told
-    directions = [path for path in entities if path.startswith("/latent/directions/")]
-    assert len(directions) == 8
-    assert names(entities["/latent/directions/slow_1"])[0].startswith("slow 1: ")
-    reader = RrdReader(recorded)
-    layout = [columns(chunk) for chunk in reader.stream(store=reader.blueprints()[0])]
-    named = [each[name] for each in layout for name in each if name.endswith(":display_name")]
-    titles = {title for column in named for title in column.to_pylist()[0] or ()}
-    assert {"forecasts", "slow and fast directions"} < titles
-    assert any(re.fullmatch(r"heading cos: R² -?\d+\.\d\d over 10 steps", each) for each in titles)
-
-
-def test_data_for_forecasts(folder):
-    task = describe("face_direction", max_episode_steps=200)
-    given = {"source": "uniform", "task": task, "encoder": "dae-8", "out": folder / "data.rrd"}
-    own = text(read(inspect(**given))["/provenance"])
-    assert "Forecasts are fitted to this same episode." in own
-    other = text(read(inspect(**given, data=Path(FACE)))["/provenance"])
-    assert f"Forecasts are fitted to 3 training episodes of {FACE}." in other
-    with pytest.raises(InputError, match="move_to_pose"):
-        inspect(**given, data=Path(POSE))
-    with pytest.raises(InputError, match="--data is for forecasts from a latent"):
-        inspect(FACE, data=Path(FACE))
 
 
 @pytest.fixture(scope="module")
@@ -747,7 +548,7 @@ def test_the_force_of_a_contact_is_the_one_on_the_robot():
     )
     data = mujoco.MjData(model)
     arrays = {"qpos": data.qpos[None].copy(), "qvel": data.qvel[None].copy()}
-    (force,) = contacts(Robot(model), Motion(model, arrays)).forces
+    (force,) = contacts(Robot(model), Motion(model, arrays))[2]
     assert force[2] > 1
 
 
@@ -823,44 +624,41 @@ def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("given", "named"),
     [
-        ({}, "give a SOURCE to inspect, or one encoder with its --task"),
-        ({"source": "tests"}, "tests is no data set, no run with a policy or checkpoint, and hol"),
-        ({"source": "nowhere"}, "nowhere is no data set, no run with a policy or checkpoint, and"),
-        ({"source": FACE, "episode": 9}, "has no episode 9: it has 4, numbered from 0"),
-        ({"source": FACE, "task": describe("move_to_pose")}, "is of face_direction, not of move"),
-        ({"source": FACE, "encoder": "dae-9"}, "no encoder 'dae-9'"),
-        ({"source": FACE, "traverse": True}, "--traverse moves the units of a latent: give an"),
-        ({"encoder": "dae-8"}, "no encoder at dae-8: for one that ships, give its --task, too"),
-        ({"source": "none.safetensors"}, "no encoder at none.safetensors"),
-        ({"source": POSE, "encoder": DAE}, "dae-4 was made for face_direction"),
-        ({"source": FACE, "out": Path("README.md")}, "README.md exists and is not a Rerun record"),
-        ({"source": FACE, "out": Path("docs")}, "docs exists and is not a Rerun recording"),
+        ({}, "SOURCE"),
+        ({"source": "tests"}, "tests is no data set"),
+        ({"source": "nowhere"}, "nowhere"),
+        ({"source": FACE, "episode": 9}, "episode 9"),
+        ({"source": FACE, "task": describe("move_to_pose")}, "move_to_pose"),
+        ({"source": FACE, "encoder": "dae-9"}, "dae-9"),
+        ({"source": FACE, "traverse": True}, "--traverse"),
+        ({"encoder": "dae-8"}, "--task"),
+        ({"source": "none.safetensors"}, "none.safetensors"),
+        ({"source": POSE, "encoder": DAE}, "dae-4"),
+        ({"source": FACE, "out": Path("README.md")}, "README.md"),
+        ({"source": FACE, "out": Path("docs")}, "docs"),
     ],
 )
-def test_mistakes(given, message):
-    with pytest.raises(InputError, match=re.escape(message)):
+def test_mistakes(given, named):
+    with pytest.raises(InputError, match=re.escape(named)):
         inspect(**given)
 
 
 def test_a_study_has_no_episodes(tmp_path):
     study, task = str(write_study(tmp_path / "study")), describe("face_direction")
     for given in ({"episode": 0}, {"encoder": "dae-8"}, {"traverse": True}, {"task": task}):
-        with pytest.raises(InputError, match="holds several runs, whose training curves"):
+        with pytest.raises(InputError, match="several runs"):
             inspect(study, **given)
 
 
 def test_an_earlier_recording_is_overwritten_and_nothing_else(tmp_path):
     out = tmp_path / "it.rrd"
     out.write_text("mine")
-    with pytest.raises(InputError, match="is not a Rerun recording: choose another --out"):
+    with pytest.raises(InputError, match=r"\.rrd"):
         inspect(FACE, out=out)
     assert out.read_text() == "mine"
     assert list(tmp_path.iterdir()) == [out]
-    os.mkfifo(tmp_path / "pipe.rrd")  # that nobody fills: it isn't waited for
-    with pytest.raises(InputError, match="is not a Rerun recording: choose another --out"):
-        inspect(FACE, out=tmp_path / "pipe.rrd")
     out.write_bytes(b"RRF2 an earlier one")
     inspect(FACE, out=out)
     assert "/world/robot/jitterbug" in read(out)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from jbrep.report.serving import serving
 from sklearn.metrics import r2_score
 from tensors import torch_threads
 from wide import make_feature, make_task
@@ -27,12 +28,12 @@ from jbrep.evaluate.prediction import (
     problems,
     usual_horizons,
 )
-from jbrep.evaluate.readout import nonlinear_probes, probes
-from jbrep.evaluate.regression import Problem, beside, fit
+from jbrep.evaluate.readout import probes
+from jbrep.evaluate.registry import Judged
+from jbrep.evaluate.regression import Networks, Problem, beside, fit
 from jbrep.evaluate.table import headline
 from jbrep.play.sources import find_good_policy
 from jbrep.report.evaluation import evaluation_text, in_words
-from jbrep.report.serving import serving
 
 NAMES = ("place", "speed", "load", "idle")
 STEPS, EPISODES = 60, 200
@@ -156,8 +157,8 @@ def test_what_is_dropped_shows_where_it_matters(evaluation):
     assert everything["without load"]["action"] < 0.1 < 0.9 < full["action"]
     changes = evaluation.encoders["without idle"].prediction["10"].features
     assert changes["idle"][0] < 0.1 < changes["speed"][0]
-    assert full["times_pca"] is None
-    value, low, high = evaluation.encoders["full"].value
+    assert "times_pca" not in full
+    value, low, high = evaluation.encoders["full"].scores["value"]
     assert low < value < high
 
 
@@ -260,8 +261,7 @@ def test_of_short_episodes_as_many_steps_count_as_are_known(evaluation):
     }
     told = evaluation_text(evaluation.replace(encoders=shorter), everything=True)
     assert re.search(r"^Take without idle: it tells the change of .* over the next 5 steps", told)
-    assert re.search(r"\nencoder +size +forward +rewarded +reward", told)
-    assert "the features' change over 5 steps" in told
+    assert "Episodes allow to look 5 steps ahead in place of 10." in told
     blind = {label: known.replace(prediction={}) for label, known in shorter.items()}
     none = evaluation.replace(encoders=blind, needs={})
     unsaid = "Which code serves can't be said: episodes are too short to look ahead."
@@ -272,7 +272,7 @@ def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkey
     monkeypatch.setattr(regression, "_STEPS", 2)
     result = diagnose({"it": code(held_out.data, "place")}, held_out.data)
     assert result.policy is None
-    assert all(d.value is d.action is None for d in result.encoders.values())
+    assert not any({"value", "action"} & {*each.scores} for each in result.encoders.values())
     assert "return to go" not in evaluation_text(result)
     assert find_good_policy(None, held_out.data.task) is None
     cut = [PlayedEpisode(np.zeros((101, 4), np.float32), np.ones(100), False)] * 5
@@ -287,14 +287,15 @@ def test_an_episodes_values_are_judged_by_what_was_fitted_to_others(held_out, po
     seen, it = policy.states, code(held_out.data, "place")
     told = control.problems(it, held_out, policy)
     assert [name for name in told if name != "action"] == ["value 0", "value 1", "value 2"]
-    assert np.sum(seen.folds, axis=0).tolist() == [1] * len(seen.value)
+    assert np.sum([*seen.folds.values()], axis=0).tolist() == [1] * len(seen.value)
 
     def oracle(problem):
         known = {tuple(row): value for row, value in zip(*problem[:2], strict=True)}
         return lambda values: np.array([known.get(tuple(row), [1e3]) for row in values])
 
     known = {name: oracle(problem) for name, problem in told.items()}
-    assert control.value(it, policy, known).value < 0
+    judged = Judged(it, held_out, policy, Networks({}, None, known), None)
+    assert control.value(judged).value < 0
 
 
 def test_actions_after_the_horizon_do_not_enter(held_out, monkeypatch):
@@ -331,7 +332,7 @@ def test_r_squared_and_interval_by_episode(held_out):
     rows = held_out.data.test
     true = held_out.data.dataset["observation"][rows]
     predicted = true + np.random.default_rng(0).normal(size=true.shape) * [0.1, 1, 2, 0]
-    *parts, mean = explained(predicted, true, rows, held_out, [1, 1, 2], [np.array([1, 1, 0])])
+    *parts, mean = explained(predicted, true, rows, held_out.sums, [1, 1, 2], [np.array([1, 1, 0])])
     expected = [r2_score(true[:, i].astype(float), predicted[:, i]) for i in (0, 1)]
     assert [part[0] for part in parts[:2]] == pytest.approx(expected)
     assert mean[0] == pytest.approx(np.mean(expected))
@@ -401,7 +402,7 @@ def test_nonlinear_probes_read_what_linear_ones_cannot(held_out):
     encoder = code(held_out.data, "place")
     encoder = Encoder(encoder.header, encoder.scaler, (bent,), ())
     linear = probes(encoder, held_out)
-    nonlinear = nonlinear_probes(encoder, held_out, networks(encoder, held_out).probe)
+    nonlinear = probes(encoder, held_out, networks(encoder, held_out).probe)
     assert nonlinear["place"][0] > 0.98 > linear["place"][0] + 0.02
     assert nonlinear["idle"][0] < 0.1
 

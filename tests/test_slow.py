@@ -7,7 +7,7 @@ import pytest
 from deeptime.decomposition import TICA, VAMP
 from scipy.linalg import eigh, sqrtm
 
-from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.dataset import ScaledDataset, from_arrays
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.methods import passes
@@ -33,7 +33,7 @@ def system(folder, actions=None, lengths=(60, 300, 1, 200, 15, 400, 350), extra=
         reward, ends = rows[:, 0] ** 2, np.zeros(length, bool)
         for part, values in zip(parts, (rows, taken, reward, ends), strict=True):
             part.append(values)
-    return ScaledDataset(Dataset.write(folder, *parts))
+    return ScaledDataset(from_arrays(folder, *parts))
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +253,7 @@ def test_the_unit_of_the_reward_does_not_matter(kind, moved, tmp_path):
     found = []
     for unit in (1, 2.0**-40):
         columns = source["observation"][:], source["action"][:], source["reward"][:] * unit
-        data = Dataset.write(tmp_path / f"data-{unit}", *columns, ends)
+        data = from_arrays(tmp_path / f"data-{unit}", *columns, ends)
         found.append(Fitter(data, tmp_path / f"{unit}").fit(kind, **how).encoder)
     one, tiny = (each.encoder[0].weight for each in found)
     assert one.tobytes() == tiny.tobytes()
@@ -264,7 +264,7 @@ def test_rewards_that_never_vary_say_nothing(tmp_path, still):
     columns = [source["observation"][:], source["action"][:], np.ones(len(source))]
     ends = np.zeros(len(source), bool)
     ends[np.cumsum(source.episodes["length"]) - 1] = True
-    same = ScaledDataset(Dataset.write(tmp_path / "same", *columns, ends))
+    same = ScaledDataset(from_arrays(tmp_path / "same", *columns, ends))
     with pytest.raises(InputError, match="nothing that linear-forward is to predict varies"):
         made(same, "linear-forward", changes=0, values=0, latent=2)
     assert made(same, "linear-forward", horizons=(1, 5), latent=4).metrics["spectrum"][3] > 0

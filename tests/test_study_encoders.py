@@ -9,7 +9,10 @@ import numpy as np
 import onnx
 import pytest
 from command import in_this_process, jbrep
-from judged import diagnostics, evaluation, prediction
+from jbrep.report.facts import encoder_table, outline, reproduce
+from jbrep.report.figures.diagrams import autoencoders
+from jbrep.report.figures.style import styles
+from judged import diagnostics, evaluation
 from made_up import label_of
 from my_encoders import LATENT, SIZE, FirstFeatures, dense
 from small import forge
@@ -22,18 +25,15 @@ from jbrep.encoders import find, load, save
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
 from jbrep.errors import DamageError, InputError
-from jbrep.evaluate.evaluation import EVALUATION
+from jbrep.evaluate.evaluation import EVALUATION, Score
 from jbrep.evaluate.table import DIAGNOSTICS, read_diagnostics
 from jbrep.records.record import to_plain
-from jbrep.report.facts import encoder_table, outline, reproduce
-from jbrep.report.figures.diagrams import autoencoders
-from jbrep.report.figures.style import styles
 from jbrep.report.tables import read_tables
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.policy import load_run
 from jbrep.study.config import Data, as_study
-from jbrep.study.packing import forecast
+from jbrep.study.forecast import forecast
 from jbrep.study.plan import Plan, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.record import EACH_ITS_OWN, RECORD
@@ -166,7 +166,6 @@ def test_diagnostics_are_matched_by_the_encoders(done, tmp_path):
         (TASK, "full", shas["full"][0], 0.75),
         (TASK, "mine", shas["mine"][1], 0.5),
     ]
-    assert rows[0].values["error"] is None
     again = {"a": (shas["mine"][0], 0.25), "b": (shas["mine"][1], 0.125)}
     write_evaluation(tmp_path / "later", again)
     shutil.rmtree(tmp_path / TASK)  # what is in the table stays there
@@ -179,7 +178,7 @@ def test_diagnostics_are_matched_by_the_encoders(done, tmp_path):
         add_diagnostics(folder, [str(tmp_path / "none")])
     damaged = tmp_path / "later" / EVALUATION
     damaged.write_text(damaged.read_text().replace("0.25", '"many"'))
-    with pytest.raises(DamageError, match=r"prediction.mean.value must be a number"):
+    with pytest.raises(DamageError, match="scores"):
         add_diagnostics(folder, [str(tmp_path / "later")])
 
 
@@ -194,7 +193,7 @@ def write_evaluation(folder, forward):
     """An evaluation of encoders, by label: their SHA-256, and one number."""
     folder.mkdir()
     encoders = {
-        label: diagnostics(prediction={"10": prediction(each)}, sha256=sha)
+        label: diagnostics(scores={"forward": Score(each)}, sha256=sha)
         for label, (sha, each) in forward.items()
     }
     evaluation(encoders, TASK).write(folder / EVALUATION)
@@ -369,9 +368,9 @@ def test_own_encoders_are_checked_before_the_first_run(own, message, home, tmp_p
     [
         ([{"name": "a", "file": "x"}, "full", {"name": "a", "file": "y"}], "each once"),
         ([{"name": "dae-8", "file": "x"}, "dae-8"], "each once"),
-        ([7], r"representations\[0\] is 7: it must be text or a table"),
+        ([7], r"representations\[0\] is 7"),
         *(([{"name": n, "file": "x"}], "name is") for n in ("full", "..", "a/b", "", 7, [])),
-        ([{"file": "x"}], "name is None: it must be a name of letters, digits"),
+        ([{"file": "x"}], "name is None"),
         *(
             ([{"name": "a", **rest}], "a: it must have a name and one of file, code, kind")
             for rest in ({}, {"noise": 0.2, "encoders": 2})
@@ -412,10 +411,10 @@ def test_a_worker_imports_the_modules_it_is_told_to(done, tmp_path, monkeypatch)
     monkeypatch.setattr("jbrep.envs.names._imported", [])
     run = done.run(done.cells[2])
     assert run.encoder == NET
-    assigned = [Assigned("net", run, tmp_path)]
-    (crashed,) = work(assigned)
+    assigned = Assigned("net", run, tmp_path)
+    crashed = work(assigned)
     assert "add --import my_encoders" in crashed.message
-    (ended,) = work(assigned, modules=["my_encoders"])
+    ended = work(assigned, modules=["my_encoders"])
     assert ended.status == "finished"
 
 
@@ -428,10 +427,10 @@ def test_a_drawing_of_an_encoder_without_decoder_ends_with_the_latent():
 
 def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "jbrep.study.packing.estimate", lambda runs: 60 if runs[0].encoder == NET else 30
+        "jbrep.study.forecast.estimate", lambda run: 60 if run.encoder == NET else 30
     )
     runs = forecast(Plan(done.study, tmp_path / "it"), 1).runs
-    assert [seconds for _, _, seconds in runs[:5]] == [30, 30, 60, 30, 30]
+    assert [seconds for _, seconds in runs[:5]] == [30, 30, 60, 30, 30]
 
 
 def test_a_run_on_code(done, tmp_path, monkeypatch):
@@ -459,7 +458,7 @@ def test_a_run_on_an_object_resumes_with_the_same_object_alone(tmp_path):
     run = Run.of(encoder=FirstFeatures(), **SHARED)
     with pytest.raises(StoppedError):
         train(run, tmp_path, Session(stop=lambda: next(asked)))
-    with pytest.raises(InputError, match="belongs to another configuration: encoder"):
+    with pytest.raises(InputError, match="holds another run: encoder"):
         train(Run.of(encoder=FirstFeatures(-1), **SHARED), tmp_path)
     result = train(run, tmp_path)
     assert result.settings.representation == "FirstFeatures"
@@ -471,8 +470,8 @@ def test_a_run_on_an_object_resumes_with_the_same_object_alone(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"representation": "my encoder"}, "representation is 'my encoder': it must be a name"),
-        ({"encoder_seed": -1}, "encoder_seed is -1: it must be a whole number from 0"),
+        ({"representation": "my encoder"}, "representation is 'my encoder'"),
+        ({"encoder_seed": -1}, "encoder_seed is -1"),
     ],
 )
 def test_a_run_with_a_name_that_could_not_be_read_again_is_refused(settings, message):

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 
 _LETTERS = 100  # of the name of a folder
-_KEPT = "the same command resumes agents"
 
 
 @click.command(
@@ -63,16 +62,10 @@ _KEPT = "the same command resumes agents"
     "isn't seen.",
 )
 @click.option(
-    "--agents",
-    is_flag=True,
-    help="Train two small agents on each code and on the full observation, two or three minutes of "
-    "a core for each code, and show which code to take.",
-)
-@click.option(
     "--all",
     "everything",
     is_flag=True,
-    help="Show errors, probes and units, too; evaluation.json always has them.",
+    help="Show all other diagnostics, too; evaluation.json always has them.",
 )
 @import_option
 @as_json
@@ -82,16 +75,15 @@ def evaluate(
     out: Path | None,
     policy: str | None,
     truth: Path | None,
-    agents: bool,
     everything: bool,
     as_json: bool,
 ) -> None:
     """Show which encoders serve, and what each lacks.
 
     Judged on the held-out episodes: how well they predict the state and the reward, what they say
-    of a good policy's value and action, linear and nonlinear probes, reconstruction, corruption,
-    the latent's units and dimensions, nearest neighbours, and the prediction of the next latent. An
-    encoder of your own is code such as mymodule:MyEncoder; its module is imported, which runs it.
+    of a good policy's value and action, linear and nonlinear probes, reconstruction, the latent's
+    units, and the prediction of the next latent. An encoder of your own is code such as
+    mymodule:MyEncoder; its module is imported, which runs it.
     """
     from jbrep import api
     from jbrep.dataset import Dataset
@@ -112,10 +104,8 @@ def evaluate(
         label: source_of(name, whole.task) for label, name in zip(encoders, encoder, strict=True)
     }
     out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(encoders))[:_LETTERS])
-    with stoppable(_KEPT if agents else "the same command starts over"):
-        evaluation = api.evaluate(
-            encoders, whole, out, policy=policy, truth=truth, agents=agents
-        ).evaluation
+    with stoppable("the same command starts over"):
+        evaluation = api.evaluate(encoders, whole, out, policy=policy, truth=truth).evaluation
         pictures = write_plots(encoder_plots(evaluation), out)
     width = terminal_width()
     notes = [wrapped(printable(note), width) for note in _notes(encoders, sources, evaluation)]
@@ -124,12 +114,10 @@ def evaluate(
         return echo_json(evaluation.as_json())
     click.echo(evaluation_text(evaluation, width, everything) + "\n")
     click.echo("\n".join(notes))
-    has_agents = evaluation.worth is not None
-    more = {"--all shows more": everything, "--agents trains small agents on each": has_agents}
-    hints = ", ".join(hint for hint, is_done in more.items() if not is_done)
     click.echo()
     say(str(out / EVALUATION))
-    return click.echo(f"Beside it: {len(pictures)} figures." + (f" {hints}." if hints else ""))
+    more = "" if everything else " --all shows more."
+    return click.echo(f"Beside it: {len(pictures)} figures.{more}")
 
 
 def _notes(

@@ -32,12 +32,6 @@ _KEEPER = ("sh", "-c", "read -r _; kill 0")
     help="A file, a name that ships, or code, mymodule:MyEncoder; a run's own if not given.",
 )
 @click.option("--traverse", is_flag=True, help="Show what each unit of the latent moves.")
-@click.option(
-    "--data",
-    type=PATH,
-    help="A data set, to fit an encoder's forecasts to; if not given SOURCE where it is one, else "
-    "the episode shown.",
-)
 @click.option("--out", type=PATH, help="An .rrd file; one in inspect/ if not given.")
 @click.option("--view", is_flag=True, help="Open it in the Rerun viewer.")
 @click.option(
@@ -52,7 +46,6 @@ def inspect(
     episode: int | None,
     encoder: str | None,
     traverse: bool,
-    data: Path | None,
     out: Path | None,
     view: bool,
     serve: bool,
@@ -63,8 +56,7 @@ def inspect(
     SOURCE is a data set, a run, a folder with several runs, an encoder's file, or a policy such as
     uniform, which needs a --task, as does an encoder by its name. An unfinished run plays its last
     checkpoint. The robot is shown where MuJoCo simulates it; with an encoder, what is decoded is
-    shown beside what was observed, and for the Jitterbug the decoded robot beside the true one; so
-    are the next 20 steps as its latent predicts them, and the latent's slow and fast directions.
+    shown beside what was observed, and for the Jitterbug the decoded robot beside the true one.
     """
     if view and serve:
         raise InputError("--view and --serve exclude each other: choose one")
@@ -81,7 +73,7 @@ def inspect(
         check_source(source)
     from jbrep.inspection import inspect as record  # imports torch
 
-    path = record(source, episode, task, encoder, traverse, out, data, say)
+    path = record(source, episode, task, encoder, traverse, out, say)
     if view or serve:
         say(str(path))
     else:

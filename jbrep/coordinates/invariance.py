@@ -10,9 +10,9 @@ from gymnasium.spaces.utils import flatten
 
 from jbrep.coordinates.coordinates import Coordinates
 from jbrep.coordinates.made import Ingredient, System, make_coordinates
-from jbrep.envs.make import action_in, aside, make_env, reason
-from jbrep.envs.mujoco import quarter_turn
+from jbrep.envs.make import action_in, aside, make_env
 from jbrep.envs.names import spec_of
+from jbrep.envs.physics import quarter_turn
 from jbrep.envs.task import Array, Task
 from jbrep.envs.view import Window
 from jbrep.errors import InputError, Notice, refusing
@@ -40,7 +40,7 @@ def check_invariant(coordinates: Coordinates) -> None:
     end alike, too. Where all rewards were the same, a notice says that they tell nothing.
     """
     task = coordinates.task
-    with refusing(f"symmetry can't be tried on {task.name}", told=reason), aside():
+    with refusing(f"symmetry can't be tried on {task.name}"), aside():
         steps = _tried(task)
     if not steps:
         raise InputError(

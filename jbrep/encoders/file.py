@@ -24,23 +24,17 @@ SUFFIX = ".safetensors"
 
 def save(encoder: Encoder, path: Path) -> None:
     """Write an encoder's file, whole or not at all."""
-    write_whole(path, _packed(encoder, path))
+    write_whole(path, _packed(encoder))
 
 
 def save_new(encoder: Encoder, path: Path) -> None:
     """The same of a file that doesn't exist yet."""
     make_folder(path.parent)
-    write_new(path, _packed(encoder, path))
+    write_new(path, _packed(encoder))
 
 
-def _packed(encoder: Encoder, path: Path) -> bytes:
-    content = container.pack(encoder.tensors(), encoder.header.as_json())
-    if len(content) > container.MAX_BYTES:
-        raise InputError(
-            f"can't save an encoder in {path}: {len(content):,} bytes are more than "
-            f"{container.MAX_BYTES:,}, choose smaller layers"
-        )
-    return content
+def _packed(encoder: Encoder) -> bytes:
+    return container.pack(encoder.tensors(), encoder.header.as_json())
 
 
 def load(path: Path) -> Encoder:

@@ -55,7 +55,7 @@ class EncoderHeader(Document, frozen=True):
         ),
     ] = ()
     clip: Annotated[
-        Annotated[float, Meta(ge=1, le=MAX_MAGNITUDE, title="a number from 1 to 1e12")] | None,
+        Annotated[float, Meta(ge=1, le=MAX_MAGNITUDE)] | None,
         Meta(description="The limit of scaled values."),
     ] = None
     keep: Annotated[

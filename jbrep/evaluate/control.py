@@ -11,10 +11,11 @@ from scipy.signal import lfilter
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders.base import BaseEncoder
-from jbrep.evaluate.evaluation import Action, Lost, Score, Scores, nearest_horizon
+from jbrep.evaluate.evaluation import Lost, Score, Scores, nearest_horizon
 from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
 from jbrep.evaluate.prediction import Matters, following
-from jbrep.evaluate.regression import Networks, Predictor, Problem, ridge
+from jbrep.evaluate.registry import Judged, Scalar, diagnostic
+from jbrep.evaluate.regression import Networks, Problem, ridge
 from jbrep.stats.bootstrap import Array, by_episode
 
 GAMMA = 0.99
@@ -29,31 +30,19 @@ _NUMBERS = 1 << 18  # rows times features, at most, in which features are shuffl
 
 
 class PlayedEpisode(NamedTuple):
-    """An episode of n steps under a policy.
+    """An episode of n steps under a policy."""
 
-    Attributes:
-        observation: before each step and at the end, in physical units, (n + 1, d).
-        reward: of each step, (n,).
-        terminated: whether a state ended it, so that nothing more could be earned.
-    """
-
-    observation: NDArray[np.float32]
-    reward: NDArray[Any]
-    terminated: bool
+    observation: NDArray[np.float32]  # before each step and at the end, (n + 1, d), physical units
+    reward: NDArray[Any]  # of each step, (n,)
+    terminated: bool  # whether a state ended it, so that nothing more could be earned
 
 
 @dataclass(frozen=True, eq=False)
 class GoodPolicy:
-    """A policy, and what it did in some episodes.
-
-    Args:
-        name: of the policy.
-        act: its actions (n, k) from observations (n, d) in physical units.
-        episodes: that it played.
-    """
+    """A policy, and what it did in some episodes."""
 
     name: str
-    act: Callable[[NDArray[Any]], NDArray[Any]]
+    act: Callable[[NDArray[Any]], NDArray[Any]]  # actions (n, k) from observations (n, d)
     episodes: Sequence[PlayedEpisode]
 
     @cached_property
@@ -70,20 +59,20 @@ class States:
         rows: numbers of the steps, (n,).
         observation: (n, d).
         value: their discounted returns to go, (n, 1).
-        folds: which of them are in each fold, (n,) each; whole episodes are.
+        folds: by name, which of them are in each fold, (n,) each; whole episodes are.
     """
 
     def __init__(self, episodes: Sequence[PlayedEpisode]):
         known = [_known(e) for e in episodes]
-        episode = np.repeat(np.arange(len(episodes)), known)
-        self.rows = sample(np.arange(len(episode)), _ROWS)
-        self._episode, self._count = episode, len(episodes)
+        self._episode = np.repeat(np.arange(len(episodes)), known)
+        self._count = len(episodes)
+        self.rows = sample(np.arange(len(self._episode)), _ROWS)
         together = [e.observation[:n] for e, n in zip(episodes, known, strict=True)]
         self.observation = np.concatenate(together)[self.rows]
         values = [returns_to_go(e.reward)[:n] for e, n in zip(episodes, known, strict=True)]
         self.value = np.concatenate(values)[self.rows, None]
-        fold = episode[self.rows] % _FOLDS
-        self.folds = [fold == number for number in range(min(_FOLDS, len(episodes)))]
+        fold = self._episode[self.rows] % _FOLDS
+        self.folds = {f"value {i}": fold == i for i in range(min(_FOLDS, len(episodes)))}
 
     def sums(self, rows: Rows, *values: NDArray[Any]) -> list[Array]:
         """Sums of each array (n, k) over the rows of each episode, (episodes, k)."""
@@ -103,7 +92,7 @@ def returns_to_go(reward: NDArray[Any]) -> Array:
 
 
 def problems(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dict[str, Problem]:
-    """The policy's `action` and its return to go from the latent: `value 0` for fold 0, and so on.
+    """The policy's `action` and, in each fold of its episodes, its return to go from the latent.
 
     No values where too few episodes are left to fit to and to judge on.
     """
@@ -111,50 +100,41 @@ def problems(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dic
     told = {"action": Problem(encoder.encode(seen), taken)}
     if states := policy.states:
         latent = encoder.encode(states.observation)
-        for name, judged in _named(states):
+        for name, judged in states.folds.items():
             told[name] = Problem(latent[~judged], states.value[~judged], share=_SHARE)
     return told
 
 
-def _named(states: States) -> list[tuple[str, NDArray[np.bool_]]]:
-    """The name of the value for each fold, and which states are in it."""
-    return [(f"value {number}", judged) for number, judged in enumerate(states.folds)]
-
-
-def value(
-    encoder: BaseEncoder, policy: GoodPolicy | None, predictors: Mapping[str, Predictor]
-) -> Score | None:
+@diagnostic(Scalar("value", "R² of a good policy's return to go", is_first=True))
+def value(e: Judged) -> Score | None:
     """R^2 of the policy's return to go, discounted by .99, from the latent, nonlinearly.
 
-    By cross-validation: each third of its episodes is judged by what was fitted to the others; None
-    without them. The last 300 steps of an episode are left out unless a state ended it.
+    By cross-validation: each third of its episodes is judged by what was fitted to the others. The
+    last 300 steps of an episode are left out unless a state ended it.
     """
-    if policy is None or policy.states is None:
+    if e.policy is None or e.policy.states is None:
         return None
-    states = policy.states
-    latent, predicted = encoder.encode(states.observation), np.empty_like(states.value)
-    for name, judged in _named(states):
-        predicted[judged] = predictors[name](latent[judged])
-    return explained(predicted, states.value, states.rows, states)[0]
+    states = e.policy.states
+    latent, predicted = e.encoder.encode(states.observation), np.empty_like(states.value)
+    for name, judged in states.folds.items():
+        predicted[judged] = e.learnt.of_policy[name](latent[judged])
+    return explained(predicted, states.value, states.rows, states.sums)[0]
 
 
-def action(
-    encoder: BaseEncoder,
-    held_out: HeldOut,
-    policy: GoodPolicy | None,
-    predictors: Mapping[str, Predictor],
-) -> Action | None:
-    """R^2 of what the policy would do in held-out rows, from the latent: linear and nonlinear."""
-    if policy is None:
-        return None
-    seen, taken, _ = held_out.once(_acting, policy, "train")
-    unseen, true, rows = held_out.once(_acting, policy, "test")
-    latent = encoder.encode(unseen)
-    linear, nonlinear = ridge(encoder.encode(seen), taken)(latent), predictors["action"](latent)
-    return Action(
-        linear=explained(linear, true, rows, held_out)[0],
-        nonlinear=explained(nonlinear, true, rows, held_out)[0],
-    )
+@diagnostic(
+    Scalar("action", "R² of a good policy's action", is_first=True),
+    Scalar("action_linear", "the same, linear"),
+)
+def action(e: Judged) -> tuple[Score | None, Score | None]:
+    """R^2 of what the policy would do in held-out rows, from the latent."""
+    if e.policy is None:
+        return None, None
+    seen, taken, _ = e.held_out.once(_acting, e.policy, "train")
+    unseen, true, rows = e.held_out.once(_acting, e.policy, "test")
+    latent, linear = e.encoder.encode(unseen), ridge(e.encoder.encode(seen), taken)
+    told = (predict(latent) for predict in (e.learnt.of_policy["action"], linear))
+    found = [explained(each, true, rows, e.held_out.sums)[0] for each in told]
+    return found[0], found[1]
 
 
 def _acting(
@@ -168,35 +148,22 @@ def _acting(
 
 
 class Needs(NamedTuple):
-    """How much each feature is needed, from 0 to 1.
+    """How much each feature is needed, from 0 to 1."""
 
-    Attributes:
-        reward: for the mean reward of the next 10 steps, of shorter episodes of fewer, (d,); None
-            where they are too short for any, or it can't be predicted.
-        controller: for that, directly or not, or for what a policy does, by the feature's name;
-            empty where episodes are too short.
-    """
-
-    reward: Matters
-    controller: dict[str, float]
+    reward: Matters  # for the mean reward of the next 10 steps; None if it can't be predicted
+    controller: dict[str, float]  # for that or for what a policy does, by the feature's name
 
 
 def needs(
     full: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None, learnt: Networks
 ) -> Needs:
-    """What reward and controller need of the state.
+    """What reward and controller need of the state; nothing is known of very short episodes.
 
     A feature is needed for a prediction by the share of the explained variance that is lost when
     its values are shuffled among held-out rows (permutation importance; Breiman 2001). A controller
     needs it directly as much as the mean reward of the next 10 steps or, if there is a policy, its
     action or value, whichever needs it most. It needs it indirectly for the change over 10 steps
     of another feature, times how much that one is needed directly.
-
-    Args:
-        full: the observation itself.
-        held_out: to judge on.
-        policy: that does the task well, if one is known.
-        learnt: from the observation.
     """
     ahead = nearest_horizon(learnt.forward)
     if ahead is None:
@@ -209,7 +176,7 @@ def needs(
         lambda seen: told(np.hstack((full.encode(seen), inputs))), seen, steps.wanted[some]
     )
     moving, reward = shares[:, :-1], shares[:, -1]
-    of_policy = _of_policy(full, policy, learnt.of_policy, seen) if policy else []
+    of_policy = _of_policy(full, policy, learnt, seen) if policy else []
     direct = np.max([reward, *of_policy], axis=0)
     need = np.maximum(direct, (moving * direct).max(axis=1)).tolist()
     names = held_out.data.task.feature_names
@@ -217,24 +184,20 @@ def needs(
 
 
 def _of_policy(
-    full: BaseEncoder,
-    policy: GoodPolicy,
-    predictors: Mapping[str, Predictor],
-    seen: NDArray[Any],
+    full: BaseEncoder, policy: GoodPolicy, learnt: Networks, seen: NDArray[Any]
 ) -> list[Array]:
-    """How much each of what predictors say of a policy depends on each feature, (d,)."""
+    """How much what a policy does, and its value, depend on each feature, (d,) each."""
 
     def shares(name: str, observation: NDArray[Any], wanted: NDArray[Any]) -> Array:
-        predict = predictors[name]
+        predict = learnt.of_policy[name]
         return _shares(lambda seen: predict(full.encode(seen)), observation, wanted).max(axis=1)
 
     asked = [shares("action", seen, policy.act(seen))]
     if states := policy.states:
-        count = len(seen) // len(states.folds)
-        drawn = [(name, sample(np.flatnonzero(judged), count)) for name, judged in _named(states)]
-        of_folds = [
-            shares(name, states.observation[some], states.value[some]) for name, some in drawn
-        ]
+        count, of_folds = len(seen) // len(states.folds), []
+        for name, judged in states.folds.items():
+            some = sample(np.flatnonzero(judged), count)
+            of_folds.append(shares(name, states.observation[some], states.value[some]))
         asked.append(np.mean(of_folds, axis=0))
     return asked
 
@@ -244,36 +207,24 @@ def _shares(
 ) -> Array:
     """The share of what is explained of each target that shuffling each feature loses, (d, q).
 
-    Args:
-        predict: the targets (n, q) from observations (n, d).
-        observation: to shuffle, (n, d).
-        wanted: the targets, (n, q).
+    Targets (n, q) are predicted from observations (n, d).
     """
     random = np.random.default_rng(0)
     variance = np.var(wanted, axis=0, dtype=np.float64)
-
-    def error(seen: NDArray[Any]) -> Array:
-        return np.square(predict(seen) - wanted).mean(axis=0)
-
-    least = error(observation)
+    least = np.square(predict(observation) - wanted).mean(axis=0)
     explained = variance - least
-    shares = np.zeros((observation.shape[1], wanted.shape[1]))
     predicted = explained > _PREDICTABLE * variance
+    shares = np.zeros((observation.shape[1], wanted.shape[1]))
     for feature, column in enumerate(observation.T):
         shuffled = observation.copy()
         shuffled[:, feature] = random.permutation(column)
-        more = error(shuffled) - least
+        more = np.square(predict(shuffled) - wanted).mean(axis=0) - least
         shares[feature, predicted] = more[predicted] / explained[predicted]
     return shares.clip(0, 1)
 
 
 def lost(needed: Mapping[str, float], probes: Scores) -> tuple[Lost, ...]:
-    """The features that are needed and can't be read from a code, the most needed first.
-
-    Args:
-        needed: how much a controller needs each feature.
-        probes: of the code, nonlinear.
-    """
+    """The needed features that nonlinear probes can't read from a code, the most needed first."""
     return tuple(
         Lost(name=name, kept=kept, need=need)
         for name, need in sorted(needed.items(), key=lambda item: -item[1])

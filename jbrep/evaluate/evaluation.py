@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from msgspec import UNSET, UnsetType
 
-from jbrep.records.document import Document, sealed
+from jbrep.records.document import Document
 from jbrep.records.record import Record
 from jbrep.stats.bootstrap import Interval
 
@@ -26,8 +26,8 @@ class Score(NamedTuple):
     """A value with its 95 % bootstrap interval over episodes; None where it isn't defined."""
 
     value: float | None
-    low: float | None
-    high: float | None
+    low: float | None = None
+    high: float | None = None
 
 
 Scores = dict[str, Score]  # by name
@@ -53,14 +53,6 @@ class FeatureError(Record, frozen=True, kw_only=True):
     r2: Score
 
 
-class EpisodeError(Record, frozen=True, kw_only=True):
-    """The mean squared error over an episode, by its number and seed."""
-
-    episode: int
-    seed: int
-    mse: float
-
-
 class Reconstruction(Record, frozen=True, kw_only=True):
     """Squared errors over all held-out rows, of features scaled to [-1, 1]."""
 
@@ -68,24 +60,6 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     pca_mse: Score  # of PCA with as many components, fitted on the training part
     ratio_to_pca: Score | None  # None of a latent as large as the state, or if PCA loses nothing
     features: tuple[FeatureError, ...]
-    quantiles: dict[str, float]  # of rows' errors
-    worst_episodes: tuple[EpisodeError, ...]
-
-
-class Corruption(Record, frozen=True, kw_only=True):
-    """Squared errors of clean rows reconstructed from rows with noise."""
-
-    noise: float  # standard deviation, of features scaled to [-1, 1]
-    mse: Score
-    input_mse: float  # of the rows with noise themselves
-    linear_mse: Score  # of the best linear denoiser of the same latent size
-
-
-class IntrinsicDimension(Record, frozen=True, kw_only=True):
-    """How many dimensions a latent fills locally; None where it has too few distinct points."""
-
-    two_nn: float | None
-    mle: float | None
 
 
 class LatentUnits(Record, frozen=True, kw_only=True):
@@ -94,40 +68,7 @@ class LatentUnits(Record, frozen=True, kw_only=True):
     mean: tuple[float, ...]
     variance: tuple[float, ...]
     dead: tuple[int, ...]  # numbers of units that hardly vary
-    saturation: tuple[float, ...] | None  # share of rows in which a tanh unit is saturated
-    correlation: tuple[tuple[float | None, ...], ...]  # Pearson's, (l, l); None for dead units
-    participation_ratio: float | None
-    intrinsic_dimension: IntrinsicDimension
-
-
-class Neighbours(Record, frozen=True, kw_only=True):
-    """How unlike the states of nearest neighbours in the latent are: 0 to 2, KNN-MSE."""
-
-    mse: Score
-    dimensions: Scores  # of the state
-
-
-class Correlation(Record, frozen=True, kw_only=True):
-    """How directly single units show the state: 0 to 1, the ground-truth correlation (GTC)."""
-
-    mean: Score
-    dimensions: Scores  # of the state, or of a sample of its dimensions
-    state_dimensions: int  # how many there are
-
-
-class Dynamics(Record, frozen=True, kw_only=True):
-    """R^2 of what comes next, by ridge regressions on latent and action."""
-
-    linear: Score  # of the next latent, whitened
-    persistence: Score  # of the next latent, predicted to be this one
-    change: Score  # of the observation's change
-
-
-class Action(Record, frozen=True, kw_only=True):
-    """R^2 of a good policy's action, from the latent."""
-
-    linear: Score
-    nonlinear: Score
+    participation_ratio: float | None  # None where all are dead
 
 
 class Prediction(Record, frozen=True, kw_only=True):
@@ -152,20 +93,15 @@ class Diagnostics(Record, frozen=True, kw_only=True):
 
     kind: str
     latent: int
-    nonlinear_probes: Scores  # R^2 of each quantity and feature
-    reconstruction: Reconstruction | None  # None of an encoder that doesn't decode
-    corruption: tuple[Corruption, ...] | None  # likewise
-    latent_units: LatentUnits
-    probes: Scores  # R^2 of each quantity, linear
-    neighbours: Neighbours
-    correlation: Correlation
-    dynamics: Dynamics
-    value: Score | None  # R^2 of a good policy's return to go; None if it isn't known
-    action: Action | None  # None without a policy
+    sha256: str | None = None  # of the encoder; None of the full observation
+    scores: Scores  # the registered diagnostics, as far as they are known
     prediction: dict[str, Prediction]  # by the number of steps ahead
     loses: tuple[Lost, ...]  # the most needed first
+    probes: Scores  # R^2 of each quantity, linear
+    nonlinear_probes: Scores  # R^2 of each quantity and feature
+    reconstruction: Reconstruction | None  # None of an encoder that doesn't decode
+    latent_units: LatentUnits
     method: dict[str, Any]  # what the method says of its own fit, with KEPT
-    sha256: str | None = None  # of the encoder; None of the full observation
 
     @property
     def horizon(self) -> int | None:
@@ -175,17 +111,6 @@ class Diagnostics(Record, frozen=True, kw_only=True):
     def ahead(self, what: str) -> Score | None:
         """A score of the prediction at that horizon, if it is known."""
         return getattr(self.prediction[str(self.horizon)], what) if self.prediction else None
-
-
-class Worth(Record, frozen=True, kw_only=True):
-    """What small agents return that observe the codes, as far as is known; see docs/worth.md."""
-
-    runs: int  # of each code
-    steps: int  # that each run learns for
-    episodes: int  # of each run's last evaluation
-    seconds: float = 0.0  # of CPU time that all agents took so far
-    returns: dict[str, Score] = {}  # mean returns by label
-    references: dict[str, float]  # mean returns of policies that don't learn
 
 
 class JudgedOn(Record, frozen=True, kw_only=True):
@@ -207,8 +132,7 @@ class Evaluation(Document, frozen=True, kw_only=True):
     """Encoders side by side, the full observation first."""
 
     format: ClassVar[str] = "jbrep evaluation"
-    format_version: ClassVar[int] = 3
-    max_bytes: ClassVar[int] = 1 << 28
+    format_version: ClassVar[int] = 4
     indent: ClassVar[int] = 1
 
     data: JudgedOn
@@ -217,7 +141,6 @@ class Evaluation(Document, frozen=True, kw_only=True):
     policy: str | None  # the name of the good policy
     needs: dict[str, float]  # how much a controller needs each feature, 0 to 1
     encoders: dict[str, Diagnostics]  # by label
-    worth: Worth | None = None  # if it was asked for
 
     @property
     def hashes(self) -> dict[str, str]:
@@ -226,7 +149,7 @@ class Evaluation(Document, frozen=True, kw_only=True):
 
     def text(self) -> str:
         """As JSON, with numbers of six digits and each list of numbers on one line."""
-        text = json.dumps(sealed(_rounded(self.as_json())), indent=self.indent)
+        text = json.dumps(_rounded(self.as_json()), indent=self.indent)
         parts = re.compile(r'"(?:[^"\\]|\\.)*"|\[[-+.,\deEnul\s]*\]')  # text stays as it is
 
         def on_one_line(part: re.Match[str]) -> str:

@@ -1,10 +1,8 @@
 """The held-out episodes that encoders are judged on, and R^2 with intervals over episodes."""
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import cached_property
-from itertools import pairwise
 from threading import Lock
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +11,12 @@ from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import Score, scores
-from jbrep.evaluate.truth import Columns, every
 from jbrep.stats.bootstrap import Array, bootstrap, by_episode, r_squared, variation
 
 Rows = NDArray[np.int64]
 _T = TypeVar("_T")
 
-MAX_GROUPS = 1000  # of episodes, to resample
+_MAX_GROUPS = 1000  # of episodes, to resample
 MAX_NUMBERS = 1 << 23  # in an array of sampled rows: 64 MiB
 
 
@@ -29,28 +26,23 @@ def sample_rows(rows: Rows, most: int, width: int) -> Rows:
 
 
 class HeldOut:
-    """Held-out rows of a data set, by episode.
+    """Held-out rows of a data set, by episode; the truth shows more of the same motion.
 
     Sums are of groups of episodes, which intervals resample: a group for each episode or, of more
     than 1,000 episodes, 1,000 groups of neighbouring ones, equally many in each give or take one.
 
-    Args:
-        data: the data set, split and scaled.
-        truth: that it was derived from, of the same motion, if it shows more.
-
     Attributes:
-        data: as given.
+        shown: the truth, if it is given.
         hidden: names of the features that the truth alone shows.
         numbers: of the held-out episodes within the data set, (episodes,).
-        num_groups: groups of episodes.
     """
 
     def __init__(self, data: ScaledDataset, truth: Dataset | None = None):
-        self.data, self._truth = data, truth
+        self.data, self.shown = data, truth
         self.hidden = hidden_of(data.dataset, truth) if truth else ()
         self._ends = np.cumsum(data.dataset.episodes["length"], dtype=np.int64)
         self.numbers = np.unique(self._episode(data.test))
-        self.num_groups = min(len(self.numbers), MAX_GROUPS)
+        self.num_groups = min(len(self.numbers), _MAX_GROUPS)
         self._found: dict[tuple[Any, ...], Any] = {}
         self._lock = Lock()
 
@@ -62,30 +54,12 @@ class HeldOut:
             found: _T = self._found[compute, *given]
         return found
 
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    def truth(self, rows: Rows) -> Columns:
-        """What isn't seen in rows, (n, k) by its name; angles as cosine and sine."""
-        if not self._truth:
-            return {}
-        known = every(self._truth.task, self._truth["observation"][rows])
-        return {name: known[name] for name in self.hidden}
-
     def _episode(self, rows: Rows) -> Rows:
         return np.searchsorted(self._ends, rows, side="right")
 
-    def place(self, rows: Rows) -> Rows:
-        """The position of each held-out row's episode among the held-out ones, (n,)."""
-        return np.searchsorted(self.numbers, self._episode(rows))
-
     def _group(self, rows: Rows) -> Rows:
-        return self.place(rows) * self.num_groups // len(self)
-
-    def slices(self, rows: Rows) -> list[slice]:
-        """Where the rows of each group are among these."""
-        bounds = np.searchsorted(self._group(rows), np.arange(self.num_groups + 1)).tolist()
-        return [slice(*pair) for pair in pairwise(bounds)]
+        place = np.searchsorted(self.numbers, self._episode(rows))  # among those held out
+        return place * self.num_groups // len(self.numbers)
 
     def followed(self, rows: Rows) -> Rows:
         """Those rows whose next row belongs to the same episode."""
@@ -107,24 +81,10 @@ class HeldOut:
             start = stop
         return totals
 
-    @cached_property
-    def row_counts(self) -> Array:
-        """Rows of each group, (groups, 1)."""
-        return self.sums(self.data.test, np.ones((len(self.data.test), 1)))[0]
-
-    @cached_property
-    def variation(self) -> list[Array]:
-        """Sums of scaled features and of their squares over each group, (groups, d)."""
-        scaled = (chunk.astype(np.float64) for chunk in self.data.chunks(self.data.test))
-        return self.sums_of_parts(self.data.test, ((chunk, chunk**2) for chunk in scaled))
-
 
 def hidden_of(dataset: Dataset, truth: Dataset) -> tuple[str, ...]:
     """The features that a data set of the same motion has beside those of another."""
-    moved, seen = (
-        [shard.sha256["action"] for shard in each.manifest.shards] for each in (truth, dataset)
-    )
-    if moved != seen:
+    if not np.array_equal(truth["action"], dataset["action"]):
         raise InputError(
             f"{truth.folder} has other actions than {dataset.folder}: the truth must be the data "
             "set that it was derived from"
@@ -136,18 +96,11 @@ def hidden_of(dataset: Dataset, truth: Dataset) -> tuple[str, ...]:
     return hidden
 
 
-class Episodes(Protocol):
-    """Rows by episode."""
-
-    def sums(self, rows: NDArray[np.int64], *values: NDArray[Any]) -> list[Array]:
-        """Sums of each array (n, k) over the rows of each episode, (episodes, k)."""
-
-
 def explained(
     predicted: NDArray[Any],
     true: NDArray[Any],
     rows: NDArray[np.int64],
-    episodes: Episodes,
+    summed: Callable[..., list[Array]],
     widths: Sequence[int] | None = None,
     means: Sequence[NDArray[Any]] = (),
 ) -> list[Score]:
@@ -157,16 +110,13 @@ def explained(
         predicted: the columns.
         true: what they should be, (n, k).
         rows: their rows, (n,).
-        episodes: of the rows, to resample.
+        summed: sums of arrays (n, k) over the rows of each episode, which are resampled.
         widths: of the parts; None for all columns as one part.
-        means: weights of the parts, (parts,), in weighted means of those that vary, which come as
-            further parts at the end.
+        means: weights (parts,) of weighted means over those that vary, further parts at the end.
     """
     true = np.asarray(true, np.float64)
     shifted = true - true.mean(axis=0)  # keeps the digits of a small variation
-    sums = episodes.sums(
-        rows, (predicted - true) ** 2, shifted, shifted**2, np.ones((len(rows), 1))
-    )
+    sums = summed(rows, (predicted - true) ** 2, shifted, shifted**2, np.ones((len(rows), 1)))
     starts = np.cumsum([0, *(widths or [true.shape[1]])])[:-1]
 
     def statistic(residual: Array, total: Array, squares: Array, n: Array) -> Array:

@@ -11,8 +11,9 @@ from jbrep.coordinates import wrapped
 from jbrep.dataset import Column, ScaledDataset
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
-from jbrep.evaluate.evaluation import Prediction
+from jbrep.evaluate.evaluation import Prediction, Score
 from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
+from jbrep.evaluate.registry import Judged, Scalar, diagnostic
 from jbrep.evaluate.regression import Predictor, Problem
 from jbrep.training.windows import first_rows
 
@@ -25,20 +26,12 @@ _USUAL = 0.5  # the share of rows that must have as many rows after them
 
 
 class Steps(NamedTuple):
-    """Rows with what follows each of them, at some number of steps k.
+    """Rows with what follows each of them, at some number of steps k."""
 
-    Attributes:
-        rows: (n,).
-        observation: now, (n, d).
-        action: the next k actions, (n, k * m).
-        wanted: the change of each feature over k steps, see `changes`, and the mean reward over
-            them, (n, d + 1).
-    """
-
-    rows: Rows
-    observation: NDArray[np.float32]
-    action: NDArray[Any]
-    wanted: NDArray[np.float32]
+    rows: Rows  # (n,)
+    observation: NDArray[np.float32]  # now, (n, d)
+    action: NDArray[Any]  # the next k actions, (n, k * m)
+    wanted: NDArray[np.float32]  # each feature's `changes` and the mean reward, (n, d + 1)
 
     def inputs(self, encoder: BaseEncoder) -> NDArray[Any]:
         """Latents and actions side by side, (n, l + k * m)."""
@@ -51,19 +44,12 @@ def prediction(
     predictors: Mapping[int, Predictor],
     matters: Matters = None,
 ) -> dict[str, Prediction]:
-    """R^2 of each feature's change over k steps, and of the mean reward over them.
+    """R^2 of each feature's change over k steps, and of the mean reward over them, by k.
 
     Predicted nonlinearly from the latent and the next k actions, and no later ones; fitted to a
     sample of at most 100,000 training rows, judged on one of at most 50,000 held-out rows, fewer of
-    wide robots. By the number of steps k, of 1, 5, 10 and 20: those that at least half the rows
-    have after them. `mean` is that over the features that change; `rewarded` likewise, but weighted
-    by how much each matters to the reward.
-
-    Args:
-        encoder: to judge.
-        held_out: to judge on.
-        predictors: by the number of steps, of `Steps.wanted`.
-        matters: how much the reward depends on each feature, (d,); None if that isn't known.
+    wide robots. `mean` is that over the features that change; `rewarded` likewise, but weighted by
+    how much each matters to the reward, (d,), if that is known.
     """
     names = held_out.data.task.feature_names
     means = [np.append(each, 0.0) for each in (np.ones(len(names)), matters) if each is not None]
@@ -74,7 +60,7 @@ def prediction(
             predictor(steps.inputs(encoder)),
             steps.wanted,
             steps.rows,
-            held_out,
+            held_out.sums,
             widths=[1] * (len(names) + 1),
             means=means,
         )
@@ -85,6 +71,23 @@ def prediction(
             rewarded=None if matters is None else each[-1],
         )
     return results
+
+
+@diagnostic(
+    Scalar("forward", "R² of the features' change over 10 steps", is_first=True),
+    Scalar(
+        "rewarded", "R² of the change over 10 steps of what the reward depends on", is_first=True
+    ),
+    Scalar("reward", "R² of the mean reward of 10 steps", is_first=True),
+    Scalar("forward_1", "R² of the features' change over 1 step"),
+    Scalar("forward_5", "the same over 5 steps"),
+    Scalar("forward_20", "the same over 20 steps"),
+)
+def of_prediction(e: Judged) -> list[Score | None]:
+    """As `prediction` has them; 10 steps, or as near to that as episodes allow."""
+    others = (e.known.prediction.get(str(steps)) for steps in (1, 5, 20))
+    first = [e.known.ahead(what) for what in ("mean", "rewarded", "reward")]
+    return [*first, *(each.mean if each else None for each in others)]
 
 
 def problems(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, tuple[Problem, Problem]]:
@@ -125,16 +128,10 @@ def following(held_out: HeldOut, part: str, ahead: int) -> Steps:
 def changes(
     task: Task, observation: Column | NDArray[Any], rows: NDArray[np.int64], ahead: int
 ) -> NDArray[np.float64]:
-    """What features change by in so many steps after rows, (n, d).
+    """What features (d,) of all rows change by in so many steps after some rows, (n, d).
 
     Angles by all that they turn, each step the shorter way round: the difference of two angles
     jumps where a joint turns more than half round, and hardly anything could predict it.
-
-    Args:
-        task: which says what is an angle.
-        observation: all rows.
-        rows: (n,).
-        ahead: steps.
     """
     change = np.subtract(observation[rows + ahead], observation[rows], dtype=np.float64)
     angles = [feature.is_full_turn for feature in task.features]

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -10,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
+from torch.nn.functional import pad
 
 from jbrep.stats.bootstrap import Array
 from jbrep.training.trainer import single_torch_thread
@@ -52,33 +51,19 @@ def ridge(values: NDArray[Any], wanted: NDArray[Any]) -> Predictor:
 
 
 class Problem(NamedTuple):
-    """What is to be predicted from what.
+    """What is to be predicted from what."""
 
-    Attributes:
-        values: to predict from, (n, p).
-        wanted: to predict, (n, q).
-        share: of the usual steps that are taken; less where these are enough, or where rows are of
-            few episodes, which a network soon knows by heart.
-    """
-
-    values: NDArray[Any]
-    wanted: NDArray[Any]
-    share: float = 1.0
+    values: NDArray[Any]  # to predict from, (n, p)
+    wanted: NDArray[Any]  # to predict, (n, q)
+    share: float = 1.0  # of the usual steps, where fewer are enough or rows are of few episodes
 
 
 class Networks(NamedTuple):
-    """What was learnt from the latents of an encoder.
+    """What was learnt from the latents of an encoder."""
 
-    Attributes:
-        forward: what comes next, by the number of steps ahead.
-        probe: the state.
-        of_policy: a good policy's `action` and, unless its episodes are too few, its `value 0` and
-            so on, of each fold; nothing without one.
-    """
-
-    forward: dict[int, Predictor]
-    probe: Predictor
-    of_policy: dict[str, Predictor]
+    forward: dict[int, Predictor]  # what comes next, by the number of steps ahead
+    probe: Predictor  # the state
+    of_policy: dict[str, Predictor]  # a good policy's `action`, and `value 0` and so on by fold
 
 
 def fit(problems: Sequence[Problem]) -> list[Predictor]:
@@ -89,11 +74,15 @@ def fit(problems: Sequence[Problem]) -> list[Predictor]:
     networks learn independently, but those of as many steps are multiplied at once: with so few
     units, calls would take most of the time.
     """
-    steps = [_steps(each) for each in problems]
+    steps = [
+        max(1, min(int(_STEPS * each.share), _PASSES * len(each.values) // _BATCH))
+        for each in problems
+    ]
     fitted: dict[int, Predictor] = {}
-    for count in dict.fromkeys(steps):
-        among = [i for i, each in enumerate(steps) if each == count]
-        fitted |= zip(among, _fit([problems[i] for i in among], count), strict=True)
+    with single_torch_thread():
+        for count in dict.fromkeys(steps):
+            among = [i for i, each in enumerate(steps) if each == count]
+            fitted |= zip(among, _fit([problems[i] for i in among], count), strict=True)
     return [fitted[i] for i in range(len(problems))]
 
 
@@ -102,52 +91,12 @@ def beside(*predictors: Predictor) -> Predictor:
     return lambda values: np.hstack([predict(values) for predict in predictors])
 
 
-def _steps(problem: Problem) -> int:
-    return max(1, min(int(_STEPS * problem.share), _PASSES * len(problem.values) // _BATCH))
-
-
-def _fit(problems: list[Problem], steps: int) -> list[Predictor]:
-    """As `fit`, in so many steps."""
-    enter = [_Standard(problem.values) for problem in problems]
-    leave = [_Standard(problem.wanted) for problem in problems]
-    values = [at(p.values).clamp_(-_LIMIT, _LIMIT) for at, p in zip(enter, problems, strict=True)]
-    wanted = [to(p.wanted) for to, p in zip(leave, problems, strict=True)]
-    with single_torch_thread():
-        network = _trained(values, wanted, steps)
-    return [
-        partial(_predict, _one_of(network, i, at, to), at, to)
-        for i, (at, to) in enumerate(zip(enter, leave, strict=True))
-    ]
-
-
-def _one_of(network: list[Tensor], i: int, enter: "_Standard", leave: "_Standard") -> list[Tensor]:
-    """One of the networks, without what fills it up."""
-    own = [part[i] for part in network]
-    inputs, outputs = len(enter.mean), len(leave.mean)
-    return [own[0][:inputs], *own[1:-2], own[-2][:, :outputs], own[-1][:, :outputs]]
-
-
-def _predict(
-    network: list[Tensor], enter: "_Standard", leave: "_Standard", values: NDArray[Any]
-) -> Array:
-    with single_torch_thread(), torch.inference_mode():
-        blocks = enter(values).clamp_(-_LIMIT, _LIMIT).split(_BLOCK)
-        given = torch.cat([_apply(network, block) for block in blocks]).numpy()
-    return given * leave.deviation + leave.mean
-
-
 class _Standard:
-    """Columns brought to mean 0 and deviation 1; constant ones become 0.
-
-    Attributes:
-        mean: of each column, (p,).
-        deviation: of each column, (p,); 0 for constant ones.
-    """
+    """Columns (n, p) brought to mean 0 and deviation 1; constant ones become 0."""
 
     def __init__(self, values: NDArray[Any]):
-        self.mean, deviation = (
-            getattr(values, name)(axis=0, dtype=np.float64) for name in ("mean", "std")
-        )
+        self.mean = values.mean(axis=0, dtype=np.float64)
+        deviation = values.std(axis=0, dtype=np.float64)
         varies = deviation > _NEGLIGIBLE * np.abs(values).max(axis=0)
         self.deviation = np.where(varies, deviation, 0)
         self._factor = np.where(varies, 1 / np.where(varies, deviation, 1), 0)
@@ -156,54 +105,61 @@ class _Standard:
         return torch.from_numpy(((values - self.mean) * self._factor).astype(np.float32))
 
 
-def _trained(values: list[Tensor], wanted: list[Tensor], steps: int) -> list[Tensor]:
-    """Weights (m, in, out) and biases (m, 1, out) of each layer of m networks, in turn.
+def _fit(problems: Sequence[Problem], steps: int) -> list[Predictor]:
+    """Fit networks in so many steps; narrower ones are filled up with zeros, which stay zeros."""
+    enter = [_Standard(problem.values) for problem in problems]
+    leave = [_Standard(problem.wanted) for problem in problems]
+    inputs, outputs = (max(len(each.mean) for each in several) for several in (enter, leave))
 
-    Values (n, p) and what is wanted (n, q) are of each network; narrower ones are filled up with
-    zeros, from which nothing is learnt.
-    """
-    seen, true = (_padded(each) for each in (values, wanted))
-    widths = torch.tensor([each.shape[1] for each in wanted])[:, None, None]
-    begun, drawn, first = [], [], 0
-    for now, then in zip(values, wanted, strict=True):  # each as if it were alone
-        random = torch.Generator().manual_seed(0)
-        begun.append(_begin((now.shape[1], *_HIDDEN, then.shape[1]), random))
+    def seen(i: int, values: NDArray[Any]) -> Tensor:
+        limited = enter[i](values).clamp_(-_LIMIT, _LIMIT)
+        return pad(limited, (0, inputs - limited.shape[1]))
+
+    def predictor(i: int, network: list[Tensor]) -> Predictor:
+        def predict(values: NDArray[Any]) -> Array:
+            with single_torch_thread(), torch.inference_mode():
+                blocks = [_apply(network, block) for block in seen(i, values).split(_BLOCK)]
+                given = torch.cat(blocks)[:, : len(leave[i].mean)].numpy()
+            return given * leave[i].deviation + leave[i].mean
+
+        return predict
+
+    begun, drawn = list[list[Tensor]](), list[Tensor]()
+    rows, true = list[Tensor](), list[Tensor]()
+    for i, problem in enumerate(problems):  # each as if it were alone
+        random, first = torch.Generator().manual_seed(0), sum(len(each) for each in rows)
+        begun.append(_begin(len(enter[i].mean), len(leave[i].mean), inputs, outputs, random))
         numbers = torch.rand(steps, _BATCH, generator=random, dtype=torch.float64)
-        drawn.append((numbers * len(now)).long() + first)
-        first += len(now)
-    network = [_stacked(parts).requires_grad_() for parts in zip(*begun, strict=True)]
+        drawn.append((numbers * len(problem.values)).long() + first)
+        rows.append(seen(i, problem.values))
+        wanted = leave[i](problem.wanted)
+        true.append(pad(wanted, (0, outputs - wanted.shape[1])))
+    network = [torch.stack(parts).requires_grad_() for parts in zip(*begun, strict=True)]
+    widths = torch.tensor([len(each.mean) for each in leave])[:, None, None]
+    every, targets = torch.cat(rows), torch.cat(true)
     adam = torch.optim.Adam(network, lr=_LEARNING_RATE, fused=True)
-    for step, rows in enumerate(torch.stack(drawn, 1)):
+    for step, some in enumerate(torch.stack(drawn, 1)):
         rising, falling = (step + 1) / (_RISING * steps), (1 + math.cos(math.pi * step / steps)) / 2
         adam.param_groups[0]["lr"] = _LEARNING_RATE * min(rising, 1) * falling
-        error = _apply(network, seen[rows]) - true[rows]
+        error = _apply(network, every[some]) - targets[some]
         adam.zero_grad()
         ((error.square() / widths).sum() / _BATCH).backward()
         adam.step()
-    return [each.detach() for each in network]
+    return [predictor(i, [part[i].detach() for part in network]) for i in range(len(problems))]
 
 
-def _begin(sizes: Sequence[int], random: torch.Generator) -> list[Tensor]:
-    """Initial weights by He et al. 2015, small ones in the last layer, and biases of 0."""
-    network = []
-    for i, (before, after) in enumerate(pairwise(sizes)):
-        scale = math.sqrt(2 / before) * (0.1 if i == len(_HIDDEN) else 1)
-        network += [torch.randn(before, after, generator=random) * scale, torch.zeros(1, after)]
+def _begin(
+    own_inputs: int, own_outputs: int, inputs: int, outputs: int, random: torch.Generator
+) -> list[Tensor]:
+    """Initial weights by He et al. 2015, small ones in the last layer, and biases of 0, in turn."""
+    network: list[Tensor] = []
+    own, sizes = (own_inputs, *_HIDDEN, own_outputs), (inputs, *_HIDDEN, outputs)
+    for (before, after), (rows, columns) in zip(pairwise(own), pairwise(sizes), strict=True):
+        scale = math.sqrt(2 / before) * (0.1 if len(network) == 2 * len(_HIDDEN) else 1)
+        weight = torch.randn(before, after, generator=random) * scale
+        padded = pad(weight, (0, columns - after, 0, rows - before))
+        network += [padded, torch.zeros(1, columns)]
     return network
-
-
-def _padded(parts: Sequence[Tensor]) -> Tensor:
-    """The rows (n, p) of all parts, one after the other, with zeros up to the widest."""
-    widest = max(part.shape[1] for part in parts)
-    return torch.cat([functional.pad(part, (0, widest - part.shape[1])) for part in parts])
-
-
-def _stacked(parts: Sequence[Tensor]) -> Tensor:
-    """Matrices (n, p) side by side, (m, n, p), with zeros up to the largest."""
-    rows, columns = (max(part.shape[axis] for part in parts) for axis in (0, 1))
-    return torch.stack(
-        [functional.pad(p, (0, columns - p.shape[1], 0, rows - p.shape[0])) for p in parts]
-    )
 
 
 def _apply(network: list[Tensor], values: Tensor) -> Tensor:

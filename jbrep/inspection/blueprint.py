@@ -1,7 +1,7 @@
 """The viewer's layout of each recording."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -12,14 +12,8 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Array, Task
 from jbrep.inspection.recording import PROVENANCE
 from jbrep.inspection.robot import Robot
-from jbrep.inspection.scene import ALIGNED, ROBOT, TRAIL, WORLD
-from jbrep.inspection.signals import (
-    PATH,
-    STEP,
-    TIME,
-    numbered_panels,
-    panels,
-)
+from jbrep.inspection.scene import ROBOT, TRAIL, WORLD
+from jbrep.inspection.signals import PATH, STEP, TIME, numbered_panels, panels
 from jbrep.play.jitterbug import jitterbug_task
 
 TRAVERSE = "traverse"  # a timeline, and the parent entity of its series
@@ -30,25 +24,23 @@ _NEAR = 1.0  # [s] shown before and after the current time: plots of signals at 
 _USUAL_TIMESTEP = 0.01  # [s] where a task's isn't known
 _MOST_PLOTS = 12  # on a page
 _EYE = (1.3, -2.5, 1.2)  # in sizes of the robot, from its root
-_NEAR_EYE = (0.9, -1.3, 0.65)  # likewise
 
 
-def episode_layout(
-    task: Task, robot: Robot | None, encoder: BaseEncoder | None, pages: Sequence[rrb.Grid] = ()
-) -> rrb.Blueprint:
-    """The robot on the left, its signals on the right; the signals alone if there is no robot.
-
-    Pages about the encoder are more tabs beside the observation's, which take more than half of the
-    height.
-    """
+def episode_layout(task: Task, robot: Robot | None, encoder: BaseEncoder | None) -> rrb.Blueprint:
+    """The robot on the left, its signals on the right; the signals alone if there is no robot."""
     decodes = encoder is not None and encoder.can_decode
     has_ghost = decodes and robot is not None and jitterbug_task(task) is not None
-    observed = _features("observation", task, ["observation"])
+    signals = _features("observation", task, ["observation"])
     if decodes:
-        observed = _decoded(task, has_ghost)
+        both = ["observation", "reconstruction"]
+        totals = ["error/bodies", "error/total"] if has_ghost else ["error/total"]
+        signals = [
+            *_features("observation (thick) and decoded", task, both),
+            *_features("error", task, ["error"], "scaled", totals),
+        ]
     about = rrb.TextDocumentView(origin=PROVENANCE, name="provenance")
-    numbers: list[rrb.Container] = [rrb.Tabs(*observed, *pages, about)]
-    near = {"time_ranges": _near(task)}
+    numbers: list[rrb.Container] = [rrb.Tabs(*signals, about)]
+    near = {"time_ranges": _window(task, _NEAR, _NEAR)}
     if encoder:
         units = [
             _series(path.replace("units", "latent").replace("_", " "), [f"latent/{path}"], **near)
@@ -60,25 +52,20 @@ def episode_layout(
     numbers.append(rrb.Horizontal(*acting, _series("reward", ["reward/**"])))
     shares = [1.2 * len(numbers), *[1.2] * (len(numbers) - 2), 1]
     column = rrb.Vertical(*numbers, row_shares=shares)
-    scene = _scene(task, robot, encoder is not None, has_ghost)
-    timeline = STEP if task.timestep is None else TIME
-    return _blueprint(rrb.Horizontal(*scene, column) if scene else column, timeline)
-
-
-def series_pages(
-    name: str, task: Task, plots: Mapping[str, Sequence[str]], others: Sequence[str] = ()
-) -> list[rrb.Grid]:
-    """Pages of plots of what is near in time, then of others of everything.
-
-    Args:
-        name: of the pages.
-        task: of the episode.
-        plots: the entities that each shows, by its title.
-        others: an entity each.
-    """
-    look = {"plot_legend": rrb.PlotLegend(visible=False), "time_ranges": _near(task)}
-    near = [_series(title, contents, **look) for title, contents in plots.items()]
-    return _pages(name, [*near, *(_series(each, [each]) for each in others)])
+    scene: list[rrb.View] = []
+    if robot:
+        following = rrb.EyeControls3D(
+            position=robot.place + robot.size * np.array(_EYE),
+            look_target=robot.place,
+            tracking_entity=f"{ROBOT}/{robot.names[robot.root]}",
+        )
+        ghost = "robot and decoded robot: blue is 1 mm off, yellow 10 cm"
+        shown, trail = ghost if has_ghost else "robot", {TRAIL: _window(task, None)}
+        scene.append(_world(shown, robot, eye_controls=following, overrides=trail))
+    if encoder:
+        scene.append(_path(task))
+    left = [rrb.Vertical(*scene, row_shares=[1.6, 1][-len(scene) :])] if scene else []
+    return _blueprint(rrb.Horizontal(*left, column), STEP if task.timestep is None else TIME)
 
 
 def traversal_layout(units: int, robot: Robot | None, places: Array) -> rrb.Blueprint:
@@ -93,13 +80,7 @@ def traversal_layout(units: int, robot: Robot | None, places: Array) -> rrb.Blue
         return _blueprint(below, TRAVERSE)
     half = places[:, 0].max() + 1.3 * robot.size
     eye = rrb.EyeControls3D(position=(0, -0.75 * half, 0.25 * half), look_target=(0, 0, 0.04))
-    view = rrb.Spatial3DView(
-        origin=WORLD,
-        name="a robot for each unit",
-        eye_controls=eye,
-        background=_BACKGROUND,
-        line_grid=_checks(robot),
-    )
+    view = _world("a robot for each unit", robot, eye_controls=eye)
     return _blueprint(rrb.Vertical(view, below), TRAVERSE)
 
 
@@ -131,67 +112,13 @@ def _blueprint(
     )
 
 
-def _decoded(task: Task, has_ghost: bool) -> list[rrb.Grid]:
-    """Pages of features beside what is decoded, then of their errors."""
-    both = _features("observation (thick) and decoded", task, ["observation", "reconstruction"])
-    others = ("error/bodies", "error/total") if has_ghost else ("error/total",)
-    return [*both, *_features("error", task, ["error"], "scaled", others)]
-
-
-def _scene(
-    task: Task, robot: Robot | None, has_latent: bool, has_ghost: bool
-) -> list[rrb.Container | rrb.View]:
-    """The robot, with its ghost where there is one, and the path of the latent."""
-    ghost = "robot and decoded robot: blue is 1 mm off, yellow 10 cm"
-    world = [_world(ghost if has_ghost else "robot", robot, task)] if robot else []
-    if not has_latent:
-        return [*world]
-    path = _path(task)
-    if robot is None:
-        return [path]
-    below = rrb.Horizontal(_aligned(robot), path) if has_ghost else path
-    return [rrb.Vertical(*world, below, row_shares=[1.6, 1])]
-
-
-def _world(name: str, robot: Robot, task: Task) -> rrb.Spatial3DView:
-    """The scene, seen by a camera that follows the robot."""
-    return rrb.Spatial3DView(
-        origin=WORLD,
-        contents=[f"{WORLD}/**", f"- {ALIGNED}/**"],
-        name=name,
-        eye_controls=rrb.EyeControls3D(
-            position=robot.place + robot.size * np.array(_EYE),
-            look_target=robot.place,
-            tracking_entity=_root(robot),
-        ),
-        overrides={TRAIL: _window(task, None)},
-        background=_BACKGROUND,
-        line_grid=_checks(robot),
-    )
-
-
-def _aligned(robot: Robot) -> rrb.Spatial3DView:
-    """Seen from the robot: its decoded orientation and motor angle."""
-    return rrb.Spatial3DView(
-        origin=_root(robot),
-        contents=[f"{ROBOT}/**", f"{ALIGNED}/**"],
-        name="decoded orientation, overlaid on the robot",
-        eye_controls=rrb.EyeControls3D(
-            position=robot.size * np.array(_NEAR_EYE), look_target=(0, 0, 0)
-        ),
-        background=_BACKGROUND,
-        line_grid=False,
-    )
-
-
-def _root(robot: Robot) -> str:
-    return f"{ROBOT}/{robot.names[robot.root]}"
-
-
-def _checks(robot: Robot) -> rrb.LineGrid3D:
-    """Lines on the floor, 1 cm apart for a robot of some cm, 10 cm for one ten times as large."""
+def _world(name: str, robot: Robot, **settings: Any) -> rrb.Spatial3DView:
+    """The scene, on lines 1 cm apart for a robot of some cm, 10 cm for one ten times as large."""
     spacing = 10.0 ** math.floor(math.log10(robot.size / 3))
-    return rrb.LineGrid3D(spacing=spacing, color=(255, 255, 255, 24), stroke_width=0.7)
+    grid = rrb.LineGrid3D(spacing=spacing, color=(255, 255, 255, 24), stroke_width=0.7)
+    return rrb.Spatial3DView(
+        origin=WORLD, name=name, background=_BACKGROUND, line_grid=grid, **settings
+    )
 
 
 def _path(task: Task) -> rrb.Spatial2DView:
@@ -217,20 +144,18 @@ def _window(task: Task, before: float | None, after: float = 0.0) -> rrb.Visible
     return rrb.VisibleTimeRanges([rrb.VisibleTimeRange(t, start=a, end=b) for t, a, b in ends])
 
 
-def _near(task: Task) -> rrb.VisibleTimeRanges:
-    return _window(task, _NEAR, _NEAR)
-
-
 def _features(
     name: str, task: Task, roots: Sequence[str], unit: str = "", others: Sequence[str] = ()
 ) -> list[rrb.Grid]:
     """Pages with a plot for each panel of features, then one for each of the other entities."""
-    plots = {}
+    legend = rrb.PlotLegend(visible=False)
+    look = {"plot_legend": legend, "time_ranges": _window(task, _NEAR, _NEAR)}
+    plots = []
     for panel, place in panels(task.groups).items():
         shown = unit or task.features[place.start].unit
         title = f"{panel} [{shown}]" if shown else panel
-        plots[title] = [f"{root}/{panel}" for root in roots]
-    return series_pages(name, task, plots, others)
+        plots.append(_series(title, [f"{root}/{panel}" for root in roots], **look))
+    return _pages(name, [*plots, *(_series(each, [each]) for each in others)])
 
 
 def _pages(name: str, plots: Sequence[rrb.View]) -> list[rrb.Grid]:

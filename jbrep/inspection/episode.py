@@ -1,72 +1,58 @@
-"""A recording of an episode, with an encoder's reconstruction of it."""
+"""Recordings of an episode with its reconstruction, and of what each unit of a latent moves."""
 
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
 
+from jbrep.coordinates.nearest import continuous
+from jbrep.coordinates.placing import placed
 from jbrep.encoders.base import BaseEncoder
-from jbrep.inspection.blueprint import episode_layout, series_pages
-from jbrep.inspection.directions import name_directions, send_directions
-from jbrep.inspection.fan import fan_pages, make_fan, send_fan
-from jbrep.inspection.forecast import Examples, decode
-from jbrep.inspection.recording import Recording
+from jbrep.envs.physics import Motion
+from jbrep.envs.task import Array
+from jbrep.inspection.blueprint import TRAVERSE, episode_layout, traversal_layout
+from jbrep.inspection.recording import GREY, Recording
 from jbrep.inspection.robot import Robot
-from jbrep.inspection.scene import send_ghost, send_scene
-from jbrep.inspection.signals import send_encoding, send_signals, send_terms, times_at
+from jbrep.inspection.scene import WORLD, as_qpos, send_floor, send_ghost, send_scene
+from jbrep.inspection.signals import scaled_titles, send_encoding, send_signals, times_at
+from jbrep.jitterbug.tasks import POSITION
 from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.rollout import Rollout
 
+POINTS = 101
+SPACING = 0.12  # [m] between the robots
+_ENDS = (1, 99)  # [%] of the episode's latents
+_LABEL_HEIGHT = 0.1  # [m]
+_MOST = 3  # features that the summary lists for a unit
 
-def record_episode(
-    rollout: Rollout,
-    path: Path,
-    encoder: BaseEncoder | None = None,
-    examples: Examples | None = None,
-) -> None:
-    """Write an episode's recording.
 
-    Args:
-        rollout: the episode.
-        path: the .rrd file.
-        encoder: for the episode's task; its latent is shown with what it predicts, and its
-            reconstruction if it decodes.
-        examples: what forecasts and directions are fitted to; the episode itself if not given.
-    """
+def record_episode(rollout: Rollout, path: Path, encoder: BaseEncoder | None = None) -> None:
+    """Write an episode's recording, with an encoder's latent, and what it decodes if it does."""
     task, motion = rollout.task, rollout.motion
     content = [rollout.observation, rollout.action, rollout.reward]
     if motion:
         content.append(motion.qpos)
-    if examples is None:
-        examples = Examples([rollout.observation], [rollout.action], "this same episode")
-    fan = make_fan(rollout, encoder, examples) if encoder else None
-    about = provenance(rollout, encoder, fan.about if fan else "")
-    recording = Recording(rollout.name, about, *content)
+    recording = Recording(rollout.name, provenance(rollout, encoder), *content)
     times = times_at(task, np.arange(len(rollout) + 1))
-    robot, pages = Robot(motion.model) if motion else None, []
+    robot = Robot(motion.model) if motion else None
     send_signals(recording, rollout)
     if robot and motion:
         send_scene(recording, robot, times, motion)
-        send_terms(recording, task, motion)
     if encoder:
-        latent = encoder.encode(rollout.observation)
-        seen = rollout.observation
-        decoded = decode(encoder, task, latent, seen) if encoder.can_decode else None
+        latent, decoded = encoder.encode(rollout.observation), None
+        if encoder.can_decode:
+            back = encoder.decode(latent).astype(np.float64)
+            decoded = placed(task, back, rollout.observation) if encoder.not_decoded else back
         send_encoding(recording, times, rollout, encoder, latent, decoded)
         if decoded is not None and robot and motion and jitterbug_task(task):
             send_ghost(recording, robot, times, task, motion, decoded)
-        if fan:
-            send_fan(recording, rollout, fan, robot)
-            pages += fan_pages(task, fan)
-        if directions := name_directions(encoder, task, examples):
-            send_directions(recording, times, latent.astype(np.float64), directions)
-            plots = {label: [path] for label, path in directions.paths.items()}
-            pages += series_pages("slow and fast directions", task, plots)
-    recording.write(path, episode_layout(task, robot, encoder, pages))
+    recording.write(path, episode_layout(task, robot, encoder))
 
 
-def provenance(rollout: Rollout, encoder: BaseEncoder | None, more: str = "") -> str:
-    """The origin of an episode and its encoder as Markdown, and more of it below."""
+def provenance(rollout: Rollout, encoder: BaseEncoder | None) -> str:
+    """The origin of an episode and its encoder as Markdown."""
     facts = {"task": rollout.task.name}
     if rollout.task.arguments:
         facts["arguments"] = f"`{', '.join(rollout.task.given_arguments)}`"
@@ -87,5 +73,69 @@ def provenance(rollout: Rollout, encoder: BaseEncoder | None, more: str = "") ->
             "SHA-256": f"`{encoder.fingerprint}`",
         }
     facts |= {package: version(package) for package in ("jbrep", "mujoco")}
-    lines = [f"# {rollout.name}", "", *(f"- {name}: {fact}" for name, fact in facts.items())]
-    return "\n".join([*lines, *(("", more) if more else ())])
+    lines = (f"- {name}: {fact}" for name, fact in facts.items())
+    return "\n".join([f"# {rollout.name}", "", *lines])
+
+
+def sweep(latent: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Latents (l, 101, l) that vary one unit at a time, with the others at their medians.
+
+    The range of each unit is that of the latents (n, l), from their 1st to their 99th percentile.
+    """
+    low, high = np.percentile(latent, _ENDS, axis=0)
+    units = latent.shape[1]
+    swept = np.tile(np.median(latent, axis=0), (units, POINTS, 1))
+    swept[range(units), :, range(units)] = np.linspace(low, high, POINTS, axis=1)
+    return swept.astype(np.float32)
+
+
+def record_traversal(rollout: Rollout, path: Path, encoder: BaseEncoder) -> None:
+    """Write a recording of what is decoded while one unit after the other varies.
+
+    The episode's latents give the range of each unit; of a Jitterbug there is a robot for each.
+    """
+    encoder.check_decodes("--traverse shows what each unit is decoded to")
+    task, swept = rollout.task, sweep(encoder.encode(rollout.observation))
+    name = f"{encoder.name} on {rollout.name}: each unit of the latent"
+    recording = Recording(name, provenance(rollout, encoder), swept)
+    times = [rr.TimeColumn(TRAVERSE, sequence=np.arange(POINTS))]
+    robot, titles, places = None, scaled_titles(task), np.zeros((len(swept), 3))
+    places[:, 0] = SPACING * (np.arange(len(swept)) - (len(swept) - 1) / 2)  # in a row
+    if rollout.motion and jitterbug_task(task):
+        robot = Robot(rollout.motion.model)
+        recording.send(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        send_floor(recording, robot, places)
+    summary = ["| unit | from | to | moves most |", "|---|---|---|---|"]
+    for unit, (latent, place) in enumerate(zip(swept, places, strict=True)):
+        decoded, below = encoder.decode(latent).astype(np.float64), f"{TRAVERSE}/unit_{unit}"
+        if robot:
+            _send_robot(recording, robot, times, as_qpos(task, decoded), unit, place)
+        smooth = continuous(task, decoded)
+        scaled = encoder.scale(smooth)
+        most = np.argsort(-np.ptp(scaled, axis=0))[:_MOST]
+        recording.send_series(f"{below}/decoded", times, scaled, titles)
+        recording.send_series(f"{below}/most", times, scaled[:, most], [titles[i] for i in most])
+        ends = f"{latent[0, unit]:.2f} | {latent[-1, unit]:.2f}"
+        spans = [(task.features[i], np.ptp(smooth[:, i])) for i in most]
+        told = ", ".join(f"{f.name} {span:.3g} {f.unit}".removesuffix(" 1") for f, span in spans)
+        summary.append(f"| {unit} | {ends} | {told} |")
+    recording.send_text(f"{TRAVERSE}/summary", "\n".join(summary))
+    recording.write(path, traversal_layout(len(swept), robot, places))
+
+
+def _send_robot(
+    recording: Recording,
+    robot: Robot,
+    times: list[rr.TimeColumn],
+    qpos: Array,
+    unit: int,
+    place: Array,
+) -> None:
+    """Send a unit's robot and label; decoded x and y are left out, to keep it in the row."""
+    here, path = qpos.copy(), f"{WORLD}/unit_{unit}"
+    here[:, POSITION.start : POSITION.start + 2] = place[:2]
+    poses = robot.poses(Motion(robot.model, {"qpos": here}))
+    robot.draw(recording, path, times, poses, robot.bodies)
+    above, text = [(*place[:2], _LABEL_HEIGHT)], [f"unit {unit}"]
+    label = rr.Points3D(above, labels=text, colors=[GREY], radii=[0.0], show_labels=True)
+    recording.send(f"{path}/label", label)

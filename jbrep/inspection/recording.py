@@ -2,17 +2,17 @@
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from jbrep.errors import InputError
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder, open_regular, write_whole
+from jbrep.records.storage import exists, make_folder, write_whole
 
 PROVENANCE = "provenance"
 SUFFIX = ".rrd"
@@ -31,10 +31,9 @@ def palette(count: int) -> list[Colour]:
     return [_COLOURS[i % len(_COLOURS)] for i in range(count)]
 
 
-def lighten(colour: Colour) -> Colour:
-    """A colour halfway to white."""
-    red, green, blue = ((part + 255) // 2 for part in colour)
-    return red, green, blue
+def pieces(path: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The line from each point of a path (n, k) to the next, (n, 2, k); the first has no length."""
+    return np.stack((np.concatenate((path[:1], path[:-1])), path), axis=1).astype(np.float32)
 
 
 class Recording:
@@ -126,12 +125,5 @@ def check_out(path: Path) -> None:
         if path.suffix != SUFFIX:
             name = path.with_suffix(SUFFIX)
             raise InputError(f"a recording is a file such as {name}, not {path}")
-        return
-    try:
-        file = open_regular(path)
-    except OSError as error:
-        raise InputError(f"can't write {path}: {error.strerror or error}") from None
-    with file or BytesIO() as content:
-        earlier = content.read(len(_MAGIC)) == _MAGIC
-    if not earlier:
+    elif not path.is_file() or path.read_bytes()[: len(_MAGIC)] != _MAGIC:
         raise InputError(f"{path} exists and is not a Rerun recording: choose another --out")

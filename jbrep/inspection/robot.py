@@ -10,8 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.envs.mujoco import root_of
-from jbrep.envs.physics import Motion
+from jbrep.envs.physics import Motion, root_of
 from jbrep.envs.task import Array
 from jbrep.inspection.recording import Recording
 
@@ -39,23 +38,22 @@ def rotate(quaternion: Array, vector: Array) -> Array:
 
 
 class Poses(NamedTuple):
-    """Where the bodies of a model are in n states, in the world; of one body, without that axis."""
+    """Where the bodies of a model are in n states; of one body, without that axis."""
 
     position: Array  # (n, bodies, 3) [m]
     quaternion: Array  # (n, bodies, 4)
 
-    def of(self, body: int) -> "Poses":
-        """Those of one body."""
-        return Poses(self.position[:, body], self.quaternion[:, body])
-
-    def seen_from(self, other: "Poses") -> "Poses":
-        """Those of one body in the frame of another."""
-        back, turned = other.quaternion * (1, -1, -1, -1), self.quaternion
-        scalar = (other.quaternion * turned).sum(axis=1, keepdims=True)
+    def of(self, body: int, carrier: int | None = None) -> "Poses":
+        """Those of one body, in the world or in the frame of another."""
+        place, turned = self.position[:, body], self.quaternion[:, body]
+        if carrier is None:
+            return Poses(place, turned)
+        back = self.quaternion[:, carrier] * (1, -1, -1, -1)
+        scalar = (back * turned * (1, -1, -1, -1)).sum(axis=1, keepdims=True)
         axis = back[:, :1] * turned[:, 1:] + turned[:, :1] * back[:, 1:]
         axis += np.cross(back[:, 1:], turned[:, 1:])
-        place = rotate(back, self.position - other.position)
-        return Poses(place, np.concatenate((scalar, axis), axis=1))
+        away = rotate(back, place - self.position[:, carrier])
+        return Poses(away, np.concatenate((scalar, axis), axis=1))
 
     @property
     def is_still(self) -> bool:
@@ -78,6 +76,7 @@ class Robot:
         others: numbers of all other bodies, such as the world and a target.
         place: of the root in the model's reference pose, (3,) [m].
         size: from the root's origin to the farthest point of the robot, in the same pose [m].
+        weight: of the robot [N].
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -95,21 +94,13 @@ class Robot:
             f"{carrier}/{name}" if body in self.bodies and body != self.root else name
             for body, name in enumerate(self.names)
         ]
-        self.place, self.size = self._reach()
-
-    @property
-    def weight(self) -> float:
-        """The robot's weight [N]."""
-        gravity = float(np.linalg.norm(self.model.opt.gravity))
-        return float(self.model.body_subtreemass[self.root]) * gravity
-
-    def _reach(self) -> tuple[Array, float]:
-        data = mujoco.MjData(self.model)
-        mujoco.mj_kinematics(self.model, data)
+        self.weight = float(model.body_subtreemass[self.root] * np.linalg.norm(model.opt.gravity))
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        self.place = data.xpos[self.root].copy()
         geoms = [g for body in self.bodies for g in self.geoms(body)]
-        away = np.linalg.norm(data.geom_xpos[geoms] - data.xpos[self.root], axis=1)
-        size = float((away + self.model.geom_rbound[geoms]).max(initial=0)) or _DEFAULT_SIZE
-        return data.xpos[self.root].copy(), size
+        away = np.linalg.norm(data.geom_xpos[geoms] - self.place, axis=1)
+        self.size = float((away + model.geom_rbound[geoms]).max(initial=0)) or _DEFAULT_SIZE
 
     def geoms(self, body: int) -> list[int]:
         """Numbers of a body's geoms that are visible and can be drawn; height fields can't."""
@@ -144,22 +135,18 @@ class Robot:
             times: of the states.
             poses: of all bodies in n states.
             bodies: numbers of those to draw.
-            colours: of each of them in each state, (n, len(bodies), 4), or of all, (4,); their
-                own if not given.
+            colours: of each of them in each state, (n, len(bodies), 4); their own if not given.
         """
         for i, body in enumerate(bodies):
             geoms, columns = self.geoms(body), []
-            if colours is None or colours.ndim == 1:
-                own = self.colours[geoms]
-                fixed = own if colours is None else np.tile(colours, (len(geoms), 1))
-                static: list[Any] = shapes(self.model, geoms, fixed)
-            else:
-                static = shapes(self.model, geoms, None)
+            own = self.colours[geoms] if colours is None else None
+            static: list[Any] = shapes(self.model, geoms, own)
+            if colours is not None:
                 columns = [type(shape).columns(colors=colours[:, i]) for shape in static]
-            path, there = f"{root}/{self.paths[body]}", poses.of(body)
-            if self.paths[body] != self.names[body]:
-                there = there.seen_from(poses.of(self.root))
-            place, turned = there.position, there.quaternion[:, XYZW]
+            is_carried = self.paths[body] != self.names[body]
+            there = poses.of(body, self.root if is_carried else None)
+            path, place, turned = f"{root}/{self.paths[body]}", *there
+            turned = turned[:, XYZW]
             if there.is_still:
                 still = rr.Quaternion(xyzw=turned[0])
                 static.append(rr.Transform3D(translation=place[0], quaternion=still))

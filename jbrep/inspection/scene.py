@@ -1,7 +1,6 @@
 """The episode in three dimensions: robot, surroundings, trail, contacts, decoded Jitterbug."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array, Task
-from jbrep.inspection.recording import GREEN, ORANGE, SKY, Recording
+from jbrep.inspection.recording import GREEN, ORANGE, SKY, Recording, pieces
 from jbrep.inspection.robot import XYZW, Robot, rotate
 from jbrep.jitterbug.tasks import MOTOR_QPOS, POSITION, QPOS_SIZE, QUATERNION
 
@@ -28,9 +27,7 @@ _TRAIL_RADIUS = 0.008
 _CONTACT_RADIUS = 0.016
 _WEIGHT_LENGTH = 0.65  # of the arrow for a force of the robot's weight
 GHOST = "world/ghost"
-ALIGNED = "world/aligned"
 _OPACITY = 170  # of 255
-_ALIGNED_COLOUR = (*SKY, _OPACITY)
 _RANGE = (1e-3, 1e-1)  # [m] errors at the ends of the colour scale, which is logarithmic
 _VIRIDIS = (  # without its dark end, which is invisible here; safe for colour blindness
     *((59, 82, 139), (44, 114, 142), (33, 145, 140), (40, 174, 128)),
@@ -41,18 +38,12 @@ _HEADING_RADIUS = 0.001  # [m]
 _TARGET_RADIUS = 0.006  # [m]
 
 
-class Contacts(NamedTuple):
-    """The contacts in each of n states."""
+def contacts(robot: Robot, motion: Motion) -> tuple[NDArray[np.int64], Array, Array]:
+    """The number of contacts in each of n states, and their points and forces one after the other.
 
-    counts: NDArray[np.int64]  # (n,)
-    points: Array  # (sum of the counts, 3) in the world [m]
-    forces: Array  # (sum of the counts, 3) on the robot, in world axes [N]
-
-
-def contacts(robot: Robot, motion: Motion) -> Contacts:
-    """Find the contact points and forces in each state.
-
-    Of two parts of the robot, the force is the one on the second.
+    Returns:
+        Numbers (n,); points (sum of these, 3) in the world [m]; forces on the robot, of two parts
+        of the robot those on the second, (sum of these, 3) in world axes [N].
     """
     model, is_robot = robot.model, np.isin(np.arange(robot.model.nbody), robot.bodies)
     data, force = mujoco.MjData(model), np.zeros(6)
@@ -70,7 +61,7 @@ def contacts(robot: Robot, motion: Motion) -> Contacts:
             second = touching.geom[i, 1]  # which the force acts on; below 0 for a flexible body
             on_robot = second < 0 or is_robot[model.geom_bodyid[second]]
             forces.append(force[:3] @ frame * (1 if on_robot else -1))
-    return Contacts(np.array(counts), np.concatenate(points), np.reshape(forces, (-1, 3)))
+    return np.array(counts), np.concatenate(points), np.reshape(forces, (-1, 3))
 
 
 def send_scene(
@@ -83,8 +74,10 @@ def send_scene(
     robot.draw(recording, ROBOT, times, poses, robot.bodies)
     robot.draw(recording, SURROUNDINGS, times, poses, robot.others)
     send_floor(recording, robot, path)
-    _send_trail(recording, times, path, robot.size)
-    _send_contacts(recording, times, contacts(robot, motion), robot)
+    radius = _TRAIL_RADIUS * robot.size
+    ground = np.column_stack((path[:, :2], np.full(len(path), radius)))
+    recording.send_moving(TRAIL, times, rr.LineStrips3D, SKY, radius, strips=pieces(ground))
+    _send_contacts(recording, times, motion, robot)
 
 
 def send_floor(recording: Recording, robot: Robot, path: Array) -> None:
@@ -112,25 +105,15 @@ def send_floor(recording: Recording, robot: Robot, path: Array) -> None:
         recording.send(f"{FLOOR}/{rr.escape_entity_path_part(name)}", slab)
 
 
-def _send_trail(
-    recording: Recording, times: Sequence[rr.TimeColumn], path: Array, size: float
-) -> None:
-    """Send the path of the robot's origin, (n, 3), at the height 0: a line for each step."""
-    radius = _TRAIL_RADIUS * size
-    ground = np.column_stack((path[:, :2], np.full(len(path), radius)))
-    pieces = np.stack((np.concatenate((ground[:1], ground[:-1])), ground), axis=1)
-    recording.send_moving(TRAIL, times, rr.LineStrips3D, SKY, radius, strips=pieces)
-
-
 def _send_contacts(
-    recording: Recording, times: Sequence[rr.TimeColumn], touching: Contacts, robot: Robot
+    recording: Recording, times: Sequence[rr.TimeColumn], motion: Motion, robot: Robot
 ) -> None:
-    largest = float(np.linalg.norm(touching.forces, axis=1).max(initial=0))
-    unit = robot.weight or largest or 1.0
-    arrows = touching.forces * (_WEIGHT_LENGTH * robot.size / unit)
-    points = rr.Points3D.columns(positions=touching.points).partition(touching.counts)
-    forces = rr.Arrows3D.columns(origins=touching.points, vectors=arrows).partition(touching.counts)
-    recording.send_columns(CONTACTS, times, points, forces)
+    counts, places, forces = contacts(robot, motion)
+    unit = robot.weight or float(np.linalg.norm(forces, axis=1).max(initial=0)) or 1.0
+    arrows = forces * (_WEIGHT_LENGTH * robot.size / unit)
+    points = rr.Points3D.columns(positions=places).partition(counts)
+    along = rr.Arrows3D.columns(origins=places, vectors=arrows).partition(counts)
+    recording.send_columns(CONTACTS, times, points, along)
     radius = _CONTACT_RADIUS * robot.size
     recording.send(
         CONTACTS,
@@ -168,7 +151,7 @@ def send_ghost(
     motion: Motion,
     decoded: Array,
 ) -> None:
-    """Send the decoded robot at its decoded position, and again at the true one.
+    """Send the decoded robot, whose colours show how far each body is from its true place.
 
     Args:
         recording: to draw in.
@@ -183,10 +166,6 @@ def send_ghost(
     apart = np.linalg.norm(ghost.position - true.position, axis=2)[:, robot.bodies]
     colours = shades(apart.ravel()).reshape(*apart.shape, 4)
     robot.draw(recording, GHOST, times, ghost, robot.bodies, colours)
-    aligned = np.concatenate((motion.qpos[:, POSITION], qpos[:, QUATERNION.start :]), axis=1)
-    turned = robot.poses(Motion(robot.model, {"qpos": aligned}))
-    plain = np.array(_ALIGNED_COLOUR, np.uint8)
-    robot.draw(recording, ALIGNED, times, turned, robot.bodies, plain)
     names = [f"{robot.names[body]} [mm]" for body in robot.bodies]
     recording.send_series("error/bodies", times, 1e3 * apart, names)
     _send_goal(recording, times, task, decoded, qpos)

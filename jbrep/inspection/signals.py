@@ -8,16 +8,14 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from jbrep.encoders.base import BaseEncoder
-from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array, Task
-from jbrep.inspection.recording import GREY, SKY, YELLOW, Recording, lighten, palette
+from jbrep.inspection.recording import GREY, SKY, YELLOW, Recording, pieces
 from jbrep.play.jitterbug import reward_terms
 from jbrep.play.rollout import Rollout
 
 STEP = "step"
 TIME = "time"
 MOST_LINES = 12  # in a plot
-_WIDTH, _DECODED_WIDTH = 2.0, 1.0  # of lines [points]
 PATH = "latent/path"
 _ALL_COLOUR = (90, 98, 112)
 _ALL_RADIUS, _PATH_RADIUS, _NOW_RADIUS = -1.2, -1.0, -6.0  # negative: Rerun's [points]
@@ -60,7 +58,7 @@ def times_at(task: Task, steps: NDArray[np.int64]) -> list[rr.TimeColumn]:
 
 
 def send_signals(recording: Recording, rollout: Rollout) -> None:
-    """Send the observation of each state, the actions, and the rewards if any are known."""
+    """Send observations, actions, and the rewards with their factors, as far as they are known."""
     task, states = rollout.task, np.arange(len(rollout) + 1)
     titles, times = [str(feature) for feature in task.features], times_at(task, states)
     send_features(recording, "observation", times, task, rollout.observation, titles)
@@ -72,13 +70,9 @@ def send_signals(recording: Recording, rollout: Rollout) -> None:
     if np.isfinite(rollout.reward).any():
         total, led_to = rollout.reward[:, None], times_at(task, states[1:])
         recording.send_series("reward/total", led_to, total, ["reward"], [GREY])
-
-
-def send_terms(recording: Recording, task: Task, motion: Motion) -> None:
-    """Send the factors of the reward, if the task has some."""
-    if terms := reward_terms(task, motion):
+    terms = reward_terms(task, rollout.motion) if rollout.motion else {}
+    if terms:
         values = np.stack(list(terms.values()), axis=1)
-        times = times_at(task, np.arange(len(motion)))
         recording.send_series("reward/terms", times, values, [f"{name} [1]" for name in terms])
 
 
@@ -89,15 +83,12 @@ def send_features(
     task: Task,
     values: NDArray[np.floating],
     titles: Sequence[str],
-    is_faint: bool = False,
+    width: float = 2.0,
 ) -> None:
-    """Send features (n, d), an entity for each panel; faint ones are lighter and thinner."""
+    """Send features (n, d), an entity for each panel, in lines of that width [points]."""
     for name, place in panels(task.groups).items():
         lines = titles[place]
-        colours, width = palette(len(lines)), _WIDTH
-        if is_faint:
-            colours, width = [lighten(colour) for colour in colours], _DECODED_WIDTH
-        recording.send_series(f"{path}/{name}", times, values[:, place], lines, colours, width)
+        recording.send_series(f"{path}/{name}", times, values[:, place], lines, width=width)
 
 
 def send_encoding(
@@ -112,7 +103,7 @@ def send_encoding(
     if decoded is not None:
         task, path = rollout.task, "reconstruction"
         titles = [str(f).replace(f.name, f"{f.name} decoded", 1) for f in task.features]
-        send_features(recording, path, times, task, decoded, titles, is_faint=True)
+        send_features(recording, path, times, task, decoded, titles, width=1.0)
         true = rollout.observation.astype(np.float64)
         errors = encoder.scale(encoder.comparable(decoded, true)) - encoder.scale(true)
         single, titles = errors.astype(np.float32), scaled_titles(task)
@@ -140,7 +131,5 @@ def _send_path(recording: Recording, times: Sequence[rr.TimeColumn], latent: Arr
     """Send all latents as points, lines between successive ones, and the current one."""
     path = principal_components(latent)
     recording.send(f"{PATH}/all", rr.Points2D(path, colors=[_ALL_COLOUR], radii=[_ALL_RADIUS]))
-    pieces = np.stack((np.concatenate((path[:1], path[:-1])), path), axis=1)
-    strips = pieces.astype(np.float32)
-    recording.send_moving(PATH, times, rr.LineStrips2D, SKY, _PATH_RADIUS, strips=strips)
+    recording.send_moving(PATH, times, rr.LineStrips2D, SKY, _PATH_RADIUS, strips=pieces(path))
     recording.send_moving(f"{PATH}/now", times, rr.Points2D, YELLOW, _NOW_RADIUS, positions=path)

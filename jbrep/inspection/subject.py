@@ -11,19 +11,16 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import FULL, find
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
 from jbrep.encoders.shipped import find_alone, source_of
-from jbrep.envs.task import Task, check_same
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.inspection.blueprint import TRAINING_STEP, curves_layout
-from jbrep.inspection.episode import record_episode
-from jbrep.inspection.forecast import Examples, from_dataset
+from jbrep.inspection.episode import record_episode, record_traversal
 from jbrep.inspection.recording import SUFFIX, Recording, check_out, palette
-from jbrep.inspection.traversal import record_traversal
 from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode, is_trained, run_folder
 from jbrep.records.storage import exists
@@ -33,8 +30,104 @@ from jbrep.stats.bootstrap import Array
 from jbrep.stats.runs import in_order, with_failure_returns
 from jbrep.study.results import has_runs, read_runs
 
+FOLDER = Path("inspect")  # of recordings without an --out
+_POLICY = "uniform"  # plays the episode that an encoder alone is shown on
 _RUN_WIDTH = 1.0  # [points]
 _MEDIAN_WIDTH = 4.0  # [points]
+
+
+def inspect(
+    source: str | None = None,
+    episode: int | None = None,
+    task: Task | None = None,
+    encoder: Any = None,
+    traverse: bool = False,
+    out: Path | None = None,
+    tell: Callable[[str], object] = lambda line: None,
+) -> Path:
+    """Write the Rerun recording of an episode, of a latent's units, or of a study's curves.
+
+    Args:
+        source: a data set's folder, a run's, or one with several runs below; an encoder's file, or
+            a policy's name; an encoder alone is shown on an episode under uniformly random actions.
+            A run that is not over plays its last checkpoint.
+        episode: its number, from 0; the first if not given.
+        task: of a policy or encoder by its name; a run plays it instead of its own.
+        encoder: a file, the name of one that ships, code, or an object that encodes, as
+            `jbrep.encoders.find` takes it; a run's own if not given.
+        traverse: whether to show what each unit of the latent moves, instead of the episode.
+        out: the .rrd file; one in inspect/, named after its content, if not given.
+        tell: called with a line on where an encoder is from, and on a robot that can't be shown.
+
+    Returns:
+        The file.
+    """
+    if out:
+        check_out(out)
+    if source and _is_other_folder(Path(source)) and has_runs(Path(source)):
+        if encoder is not None or traverse or task or episode is not None:
+            raise InputError(
+                f"{source} holds several runs, whose training curves are shown without --episode, "
+                "--task, --encoder and --traverse: give one run's folder to see an episode"
+            )
+        out = out or _default(source, "curves")
+        record_curves(read_runs(Path(source)), source, out)
+        return out
+    rollout, shown = _find(source, episode or 0, task, encoder)
+    if isinstance(encoder, (str, Path)):
+        tell(f"encoder: {source_of(encoder, rollout.task)}")
+    if rollout.note:
+        tell(rollout.note)
+    if traverse and not shown:
+        raise InputError("--traverse moves the units of a latent: give an --encoder")
+    if out is None:
+        more = [*([shown.name] if shown else []), *(["traverse"] if traverse else [])]
+        out = _default(source, rollout.task.slug, f"episode-{episode or 0}", *more)
+    if shown and traverse:
+        record_traversal(rollout, out, shown)
+    else:
+        record_episode(rollout, out, shown)
+    return out
+
+
+def _is_other_folder(path: Path) -> bool:
+    """Whether this is a folder, but no data set and no run."""
+    is_folder = exists(path) and path.is_dir()
+    return is_folder and not exists(path / MANIFEST) and not is_run(path)
+
+
+def _find(
+    source: str | None, episode: int, task: Task | None, encoder: Any
+) -> tuple[Rollout, BaseEncoder | None]:
+    """The episode, and the encoder to show with it."""
+    if source is None or (source.endswith(ENCODER_SUFFIX) and not is_trained(source)):
+        if (source is None) == (encoder is None):
+            raise InputError("give a SOURCE to inspect, or one encoder with its --task")
+        shown = find_alone(encoder if source is None else source, task)
+        shown.check_task(task or shown.task)
+        return find_episode(_POLICY, episode, task or shown.task), shown
+    if _is_other_folder(Path(source)):
+        check_begun(Path(source))
+        raise InputError(
+            f"{source} is no data set, no run with a policy or checkpoint, and holds no finished "
+            "run: jbrep collect makes a data set, jbrep rl a run"
+        )
+    rollout = find_episode(source, episode, task, _acting(run_folder(source), encoder))
+    return rollout, rollout.encoder if encoder is None else find(encoder, rollout.task)
+
+
+def _acting(folder: Path | None, encoder: Any) -> Any:
+    """The given encoder, if a run needs it to act: an object, where the run's folder has none."""
+    is_object = encoder is not None and not isinstance(encoder, (str, Path))
+    return encoder if is_object and folder and not exists(folder / ENCODER) else None
+
+
+def _default(source: str | None, first: str, *more: str) -> Path:
+    """A file named after its content, each word once; of a path the last three parts count."""
+    parts = Path((source or _POLICY).removesuffix(ENCODER_SUFFIX)).parts
+    named = [part for part in parts if part not in ("/", ".", "..")][-3:]
+    words = [re.sub(r"[^\w.=-]+", "-", part) for part in dict.fromkeys((first, *named, *more))]
+    return FOLDER / f"{'-'.join(words)}{SUFFIX}"
 
 
 def median_curve(runs: Sequence[RunCurve]) -> tuple[NDArray[np.int64], Array]:
@@ -49,13 +142,7 @@ def median_curve(runs: Sequence[RunCurve]) -> tuple[NDArray[np.int64], Array]:
 
 
 def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
-    """Write the training curves of runs, with a colour for each representation.
-
-    Args:
-        runs: of one study, or of several.
-        source: their folder, as the recording's title.
-        path: the .rrd file.
-    """
+    """Write the training curves of runs in a folder, with a colour for each representation."""
     labels = defaultdict(list)
     for run in sorted(with_failure_returns(runs), key=lambda run: (run.label, run.seed)):
         labels[run.label].append(run)
@@ -82,132 +169,3 @@ def _about(source: str, labels: dict[str, list[RunCurve]]) -> str:
         last = np.median([run.curve()[1][-1] for run in runs])
         lines.append(f"| {label} | {len(runs)} | {last:.0f} |")
     return "\n".join(lines)
-
-
-FOLDER = Path("inspect")  # of recordings without an --out
-_POLICY = "uniform"  # plays the episode that an encoder alone is shown on
-
-
-def inspect(
-    source: str | None = None,
-    episode: int | None = None,
-    task: Task | None = None,
-    encoder: Any = None,
-    traverse: bool = False,
-    out: Path | None = None,
-    data: Path | None = None,
-    tell: Callable[[str], object] = lambda line: None,
-) -> Path:
-    """Write the Rerun recording of an episode, of a latent's units, or of a study's curves.
-
-    Args:
-        source: a data set's folder, a run's, or one with several runs below; an encoder's file, or
-            a policy's name; an encoder alone is shown on an episode under uniformly random actions.
-            A run that is not over plays its last checkpoint.
-        episode: its number, from 0; the first if not given.
-        task: of a policy or encoder by its name; a run plays it instead of its own.
-        encoder: a file, the name of one that ships, code, or an object that encodes, as
-            `jbrep.encoders.find` takes it; a run's own if not given.
-        traverse: whether to show what each unit of the latent moves, instead of the episode.
-        out: the .rrd file; one in inspect/, named after its content, if not given.
-        data: a data set's folder, to fit forecasts to; if not given the source itself where it is a
-            data set, else the episode shown.
-        tell: called with a line on where an encoder is from, and on a robot that can't be shown.
-
-    Returns:
-        The file.
-    """
-    if out:
-        check_out(out)
-    if source and _is_study(Path(source)):
-        if encoder is not None or traverse or task or data or episode is not None:
-            raise InputError(
-                f"{source} holds several runs, whose training curves are shown without --episode, "
-                "--task, --encoder, --data and --traverse: give one run's folder to see an episode"
-            )
-        out = out or _default("curves", *_words(source))
-        record_curves(read_runs(Path(source)), source, out)
-        return out
-    rollout, shown = _find(source, episode or 0, task, encoder)
-    if isinstance(encoder, (str, Path)):
-        tell(f"encoder: {source_of(encoder, rollout.task)}")
-    if rollout.note:
-        tell(rollout.note)
-    if data and (traverse or not shown):
-        raise InputError("--data is for forecasts from a latent: give an --encoder, no --traverse")
-    if traverse and not shown:
-        raise InputError("--traverse moves the units of a latent: give an --encoder")
-    if out is None:
-        more = [*([shown.name] if shown else []), *(["traverse"] if traverse else [])]
-        out = _default(rollout.task.slug, *_words(source), f"episode-{episode or 0}", *more)
-    if shown and traverse:
-        record_traversal(rollout, out, shown)
-    else:
-        examples = _examples(source, episode or 0, data, rollout.task) if shown else None
-        record_episode(rollout, out, shown, examples)
-    return out
-
-
-def _is_study(folder: Path) -> bool:
-    """Whether a folder holds runs and is neither a run nor a data set itself."""
-    return _is_other_folder(folder) and has_runs(folder)
-
-
-def _is_other_folder(path: Path) -> bool:
-    """Whether this is a folder, but no data set and no run."""
-    if not exists(path) or not path.is_dir():
-        return False
-    return not exists(path / MANIFEST) and not is_run(path)
-
-
-def _find(
-    source: str | None, episode: int, task: Task | None, encoder: Any
-) -> tuple[Rollout, BaseEncoder | None]:
-    """The episode, and the encoder to show with it."""
-    if source is None or (source.endswith(ENCODER_SUFFIX) and not is_trained(source)):
-        if (source is None) == (encoder is None):
-            raise InputError("give a SOURCE to inspect, or one encoder with its --task")
-        shown = find_alone(encoder if source is None else source, task)
-        shown.check_task(task or shown.task)
-        return find_episode(_POLICY, episode, task or shown.task), shown
-    if _is_other_folder(Path(source)):
-        check_begun(Path(source))
-        raise InputError(
-            f"{source} is no data set, no run with a policy or checkpoint, and holds no finished "
-            "run: jbrep collect makes a data set, jbrep rl a run"
-        )
-    rollout = find_episode(source, episode, task, _acting(run_folder(source), encoder))
-    return rollout, rollout.encoder if encoder is None else find(encoder, rollout.task)
-
-
-def _examples(source: str | None, episode: int, data: Path | None, task: Task) -> Examples | None:
-    """What forecasts are fitted to, if it isn't the episode that is shown."""
-    own = Path(source) if source and exists(Path(source) / MANIFEST) else None
-    folder = data or own
-    if folder is None:
-        return None
-    dataset = Dataset(folder)
-    check_same(task, dataset.task, str(folder))
-    is_own = own is not None and own.resolve() == folder.resolve()
-    examples = from_dataset(dataset, episode if is_own else None)
-    if data and not examples:
-        raise InputError(f"{data} has too few episodes to fit forecasts to: collect more")
-    return examples
-
-
-def _acting(folder: Path | None, encoder: Any) -> Any:
-    """The given encoder, if a run needs it to act: an object, where the run's folder has none."""
-    is_object = encoder is not None and not isinstance(encoder, (str, Path))
-    return encoder if is_object and folder and not exists(folder / ENCODER) else None
-
-
-def _words(source: str | None) -> tuple[str, ...]:
-    """The last three parts of a path, which tell runs apart."""
-    path = Path((source or _POLICY).removesuffix(ENCODER_SUFFIX))
-    return tuple(part for part in path.parts if part not in ("/", ".", ".."))[-3:]
-
-
-def _default(*parts: str) -> Path:
-    """A file named after its content, each word once."""
-    words = [re.sub(r"[^\w.=-]+", "-", part) for part in dict.fromkeys(parts)]
-    return FOLDER / f"{'-'.join(words)}{SUFFIX}"

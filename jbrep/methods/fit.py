@@ -24,10 +24,9 @@ from jbrep.methods.shape import complete
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, inside, make_folder
+from jbrep.records.storage import exists, make_folder
 from jbrep.training import checkpoint
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method, Reconstructing
-from jbrep.training.network import check_layers
 from jbrep.training.trainer import Epoch, Trainer, default_batch_size, get_device, single_thread
 from jbrep.training.windows import Windows, count_windows, watched_windows
 
@@ -121,9 +120,7 @@ class Fitter:
         check_name(name)
         method.check_data(data)
         if isinstance(method, Learned):
-            objective = method.objective(data)
-            check_layers(*objective.layers())
-            windows = count_windows(data, objective.horizon)
+            windows = count_windows(data, method.objective(data).horizon)
             if not method.batch_size:
                 method = method.replace(batch_size=default_batch_size(windows))
         plan = Plan(method, data, _header(method, name, data), self._folder / f"{name}{SUFFIX}")
@@ -167,7 +164,7 @@ class Fitter:
                 self._train(plan, method)
 
     def _train(self, plan: Plan, method: Learned) -> None:
-        work = inside(self._folder, plan.path.with_suffix(".training").name)
+        work = plan.path.with_suffix(".training")
         make_folder(work)
         header, objective = plan.header, method.objective(plan.data).to(self._device)
         windows, watched = self._windows_of(plan.data, objective.horizon)
@@ -228,7 +225,7 @@ def _header(method: Method, name: str, data: ScaledDataset) -> EncoderHeader:
         environment=data.task,
         training=method.training,
         data={
-            "fingerprint": manifest.fingerprint,
+            "fingerprint": data.dataset.fingerprint,
             "policy": dict(manifest.settings.policy),
             "seed": manifest.settings.seed,
             "train_rows": len(data.train),

@@ -1,7 +1,6 @@
 """How well encoders reconstruct held-out rows, and how they compare with PCA."""
 
 from collections.abc import Container
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +31,19 @@ def held_out_error(
 
 
 def lost(
-    encoder: BaseEncoder, rows: NDArray[np.float32], data: ScaledDataset, given: Any = None
+    encoder: BaseEncoder, rows: NDArray[np.float32], data: ScaledDataset
 ) -> NDArray[np.float32]:
     """What a reconstruction of rows (n, d) lacks, in half widths of the features in the data.
 
     An encoder on coordinates is judged by what these tell of the rows: angles round the circle,
     quaternions of either sign, and a robot that symmetry puts at the origin as it stands there.
-    `given` are rows that are encoded in their place, such as corrupted ones.
+
+    Args:
+        encoder: that can decode.
+        rows: in physical units.
+        data: whose scaling counts.
     """
-    back = encoder.decode(encoder.encode(rows if given is None else given))
+    back = encoder.decode(encoder.encode(rows))
     if isinstance(encoder, Encoder) and (coordinates := encoder.scaler.coordinates):
         rows = coordinates.inverse(coordinates.forward(rows))
     return (encoder.comparable(back, rows) - rows) / data.scaler.half_width

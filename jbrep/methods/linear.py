@@ -37,22 +37,6 @@ def linear_code(weight: Array, moments: Moments) -> tuple[Layers, Layers]:
     return (dense(weight, -weight @ mean),), (dense(back, mean),)
 
 
-def linear_denoiser(latent: int, noise: float, moments: Moments) -> tuple[Layers, Layers]:
-    """The linear code of that size with the least error in restoring clean rows from corrupted.
-
-    Corruption adds noise of standard deviation `noise` to each feature. The best denoiser of full
-    rank is ridge regression, B = C (C + noise^2 I)^-1; of rank l, it is B projected on the first l
-    principal directions of its output B C (reduced-rank regression, Izenman 1975).
-    """
-    mean, covariance = moments
-    corrupted = covariance + noise**2 * np.eye(len(mean))
-    ridge = covariance @ np.linalg.pinv(corrupted, hermitian=True)
-    _, vectors = np.linalg.eigh(ridge @ covariance)
-    directions = vectors[:, ::-1][:, :latent]
-    weight = directions.T @ ridge
-    return (dense(weight, -weight @ mean),), (dense(directions, mean),)
-
-
 def signed(weight: Array) -> Array:
     """Rows (l, d) with signs that make the largest weight of each positive."""
     largest = np.abs(weight).argmax(axis=1, keepdims=True)

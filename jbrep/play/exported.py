@@ -12,7 +12,6 @@ from jbrep.envs.task import Array, Task, check_same
 from jbrep.errors import DamageError, InputError, first_line, refusing
 from jbrep.play.player import Player
 from jbrep.records.storage import read_file
-from jbrep.rl.policy_file import MAX_BYTES
 
 
 class Described(msgspec.Struct):
@@ -32,7 +31,7 @@ def read_exported(path: Path) -> tuple[Any, Described]:
 
     what = f"{path} isn't an ONNX model that can be run"
     with refusing(what, told=first_line, kind=DamageError):
-        made = session(read_file(path, MAX_BYTES))
+        made = session(read_file(path))
     text = made.get_modelmeta().custom_metadata_map.get("jbrep", "")
     try:
         return made, msgspec.json.decode(text, type=Described)

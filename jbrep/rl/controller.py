@@ -260,8 +260,8 @@ def load_policy(source: str | Path, encoder: Any = None) -> Controller:
     if exists(path / RUN) and exists(path / ENCODER) and encoder is None:
         _, sha256 = read_finished(path)
         return _of_file(read(path / POLICY, sha256), load(path / ENCODER))
+    from jbrep.rl.agent import acting
     from jbrep.rl.policy import load_run  # imports torch
-    from jbrep.rl.trained import acting
 
     trained = load_run(path, encoder)
     assert trained.settings is not None

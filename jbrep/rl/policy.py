@@ -10,7 +10,7 @@ from jbrep.errors import InputError, differences
 from jbrep.records.container import without
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
-from jbrep.rl.checkpoint import PARAMETERS, read_checkpoint, run_settings
+from jbrep.rl.checkpoint import PARAMETERS, Checkpoint, run_settings
 from jbrep.rl.files import (
     BEGINNING,
     CHECKPOINT,
@@ -51,8 +51,7 @@ def load_run(folder: Path, encoder: Any = None) -> Trained:
         policy = read(folder / POLICY, sha256)
         built = _untrained(folder, run.settings, encoder)
         return built.with_weights(policy.weights, policy.tensors, policy.path)
-    path = folder / CHECKPOINT
-    tensors, header = read_checkpoint(path)
+    path, header, tensors = Checkpoint.read(folder)
     built = _untrained(folder, header.settings, encoder)._replace(step=header.step)
     part = f"{PARAMETERS}policy.{acting_prefix(built.policy)}"
     weights = {

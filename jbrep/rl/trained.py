@@ -19,6 +19,7 @@ from jbrep.records import container
 from jbrep.records.container import Tensors, without
 from jbrep.rl.agent import (
     Spaces,
+    acting,
     deterministic_actor,
     global_random_state_kept,
     make_agent,
@@ -93,11 +94,6 @@ def _finite(act: Actor) -> Actor:
         return actions
 
     return checked
-
-
-def acting(policy: BasePolicy) -> BasePolicy:
-    """The part of a policy that chooses actions: without critics where they are apart."""
-    return getattr(policy, "actor", policy)
 
 
 def acting_prefix(policy: BasePolicy) -> str:

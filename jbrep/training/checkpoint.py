@@ -29,8 +29,7 @@ def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
 def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
     """Put a trainer into the state that the file holds, in place of its own."""
     state = _state(trainer)
-    most = sum(tensor.nbytes for tensor in state.values()) + container.MAX_BYTES
-    tensors, header = container.read(path, "checkpoint", most)
+    tensors, header = container.read(path, "checkpoint")
     try:
         saved = from_plain(header, _Header)
     except InputError:

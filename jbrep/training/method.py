@@ -10,8 +10,7 @@ from msgspec.structs import asdict, fields, force_setattr
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
-from jbrep.records.record import Record, default_of, from_text, to_plain
-from jbrep.records.words import bare, type_of
+from jbrep.records.record import Record, bare, default_of, from_text, to_plain, type_of
 from jbrep.training.network import get_architecture
 from jbrep.training.objective import Layers, Objective
 from jbrep.training.settings import (

@@ -1,7 +1,7 @@
 """Networks of dense layers: the paper's, and others."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from jbrep.encoders import Layer
 from jbrep.encoders.layers import AVG_L1_NORM, MAX_UNITS, activate
 from jbrep.errors import InputError, choose
-from jbrep.records.container import MAX_BYTES
 
 
 class AvgL1Norm(nn.Module):
@@ -65,18 +64,6 @@ def get_architecture(name: str) -> Architecture:
     if max(hidden) > MAX_UNITS:
         raise InputError(f"architecture {name} has {max(hidden)} units: the limit is {MAX_UNITS}")
     return replace(ARCHITECTURES["deep"], name="x".join(map(str, hidden)), hidden=hidden)
-
-
-def check_layers(*parts: Sequence[Layer] | None) -> None:
-    """Make sure that layers fit an encoder's file."""
-    every = [layer for part in parts for layer in part or ()]
-    needed = sum(layer.weight.nbytes + layer.bias.nbytes for layer in every)
-    widest = max((layer.units for layer in every), default=0)
-    if needed > MAX_BYTES or widest > MAX_UNITS:
-        raise InputError(
-            f"its layers have {needed:,} bytes and up to {widest:,} units: an encoder's file has "
-            f"at most {MAX_BYTES:,} and {MAX_UNITS:,}; choose a smaller latent size"
-        )
 
 
 @contextmanager

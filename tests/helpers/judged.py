@@ -1,16 +1,10 @@
 """Made-up evaluations of encoders."""
 
-import numpy as np
-
 from jbrep.evaluate.evaluation import (
-    Correlation,
     Diagnostics,
-    Dynamics,
     Evaluation,
-    IntrinsicDimension,
     JudgedOn,
     LatentUnits,
-    Neighbours,
     Prediction,
     Score,
 )
@@ -20,22 +14,11 @@ NOTHING = Score(None, None, None)
 
 def diagnostics(latent=2, **known):
     """An encoder of which nothing is known but what is given."""
-    units = LatentUnits(
-        mean=[0.0] * latent,
-        variance=[1.0] * latent,
-        dead=[],
-        saturation=None,
-        correlation=np.eye(latent).tolist(),
-        participation_ratio=None,
-        intrinsic_dimension=IntrinsicDimension(two_nn=None, mle=None),
-    )
+    lists = {"mean": [0.0] * latent, "variance": [1.0] * latent, "dead": []}
     nothing = {
-        **{"kind": "made-up", "nonlinear_probes": {}, "reconstruction": None, "corruption": None},
-        **{"latent_units": units, "probes": {}, "value": None, "action": None, "prediction": {}},
-        "neighbours": Neighbours(mse=NOTHING, dimensions={}),
-        "correlation": Correlation(mean=NOTHING, dimensions={}, state_dimensions=0),
-        "dynamics": Dynamics(linear=NOTHING, persistence=NOTHING, change=NOTHING),
-        **{"loses": [], "method": {}},
+        **{"kind": "made-up", "scores": {}, "prediction": {}, "loses": [], "method": {}},
+        **{"probes": {}, "nonlinear_probes": {}, "reconstruction": None},
+        "latent_units": LatentUnits(**lists, participation_ratio=None),
     }
     return Diagnostics(latent=latent, **{**nothing, **known})
 
