@@ -149,7 +149,7 @@ def test_arguments_reach_the_environment():
     [
         ("CartPole-v1", {}, "has actions in Discrete.2.: only continuous ones are possible"),
         ("Sledges/Free-v0", {}, "has actions without bounds"),
-        ("Sledges/Filmed-v0", {}, "has images as observations"),
+        ("Sledges/Filmed-v0", {}, "only features are possible"),
         ("Sledges/Endless-v0", {}, "has no time limit: give one with --episode-steps"),
         ("Pendulum", {}, "unknown task 'Pendulum'|Pendulum-v1"),
         ("Pendulum-v9", {}, "Pendulum-v9"),
