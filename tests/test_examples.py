@@ -150,3 +150,14 @@ def test_a_late_answer_does_not_stay_late(monkeypatch):
         controller.send(struct.pack("<If", 3, 0.3))
         action, is_late = newest(robot, 4, time.monotonic() + 0.05, action)
         assert (action.tolist(), is_late) == ([np.float32(0.3)], True)
+
+
+def test_what_policies_do_is_drawn(tmp_path, monkeypatch, capsys):
+    policies = ("heuristic", "constant:drive=0.5", "--task", "move_in_direction")
+    out = tmp_path / "drawn"
+    monkeypatch.setattr(sys, "argv", ["x", *policies, "--episodes", "2", "--out", str(out)])
+    runpy.run_path("examples/behaviour/behaviour.py", run_name="__main__")
+    assert capsys.readouterr().out.split() == [
+        str(out / f"{name}.png") for name in ("motor_velocity", "positions")
+    ]
+    assert (out / "positions.csv").read_text().startswith("policy,x,y,share\nheuristic,")

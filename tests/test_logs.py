@@ -36,7 +36,7 @@ from jbrep.envs import describe
 from jbrep.errors import InputError, Notice
 from jbrep.evaluate.diagnosis import diagnose
 from jbrep.methods.fit import Fitter
-from jbrep.report.serving import untold
+from jbrep.report.evaluation import untold
 
 NAMED = ("--observations", "pitch,gyro,ticks", "--actions", "u", "--time", "time")
 

@@ -32,8 +32,7 @@ from jbrep.evaluate.registry import Judged
 from jbrep.evaluate.regression import Networks, Problem, beside, fit
 from jbrep.evaluate.table import headline
 from jbrep.play.sources import find_good_policy
-from jbrep.report.evaluation import evaluation_text, in_words
-from jbrep.report.serving import serving
+from jbrep.report.evaluation import evaluation_text, in_words, judge
 
 NAMES = ("place", "speed", "load", "idle")
 STEPS, EPISODES = 60, 200
@@ -178,42 +177,32 @@ def test_an_evaluation_is_told_in_one_screen(evaluation):
     shown = evaluation_text(evaluation, 80)
     assert max(map(len, shown.splitlines())) <= 80
     assert len(shown.splitlines()) < 24
-    assert shown.startswith("Take without idle: it tells the change of what the reward depends on")
+    assert shown.startswith("Take without idle: ")
     assert re.search(r"without load +load \((<0|0\.\d\d)\)\nwithout idle +nothing", shown)
     assert re.search(r"\nfull +\d+ +0\.\d\d +0\.\d\d \[0\.\d\d, \d\.\d\d\] +0\.\d\d", shown)
+    assert re.search(r"\nwithout load .* no\n", shown)
+    assert re.search(r"\nwithout idle .* yes\n", shown)
 
 
-def test_the_smallest_code_without_a_loss_is_named_beside_a_smaller_one_with(evaluation):
+def test_the_smallest_code_without_a_loss_is_to_take_and_else_the_smallest(evaluation):
     good = evaluation.encoders["without idle"]
+    lost = evaluation.encoders["without load"].loses
     codes = {
         "full": evaluation.encoders["full"],
         "large": good.replace(latent=3, loses=()),
         "larger": good.replace(latent=4, loses=()),
-        "small": good.replace(latent=2, loses=evaluation.encoders["without load"].loses),
+        "small": good.replace(latent=2, loses=lost),
     }
-    told = serving(evaluation.replace(encoders=codes))
-    assert told.startswith("Take large: it tells the change")
-    assert "), and is the smallest that does and lacks nothing, of large and larger. small" in told
-    assert told.endswith(". small tells about as much, but lacks something.")
-    alone = serving(evaluation.replace(encoders={k: codes[k] for k in ("full", "small", "large")}))
-    assert re.search(r"^Take large: [^,]*\. small tells about as much, but lacks someth", alone)
-    nothing_known = evaluation.replace(needs=dict.fromkeys(evaluation.needs, 0.0), encoders=codes)
-    assert "smallest that does, of large and larger." in serving(nothing_known)
-    lost = codes["small"].loses
+    judged = judge(evaluation.replace(encoders=codes))
+    assert (judged.take, {*judged.serving}) == ("large", {"large", "larger", "small"})
     codes |= {label: codes[label].replace(loses=lost) for label in ("large", "larger")}
-    told = serving(evaluation.replace(encoders=codes))
-    assert told.startswith("Take small: it tells the change")
-    each = ", and is the smallest that does, of large, larger and small. But see what each lacks."
-    assert told.endswith(each)
-    alone = serving(evaluation.replace(encoders={k: codes[k] for k in ("full", "small")}))
-    assert alone.endswith("). But see what it lacks.")
+    assert judge(evaluation.replace(encoders=codes)).take == "small"
 
 
 def test_nothing_is_said_where_it_cannot_be(evaluation):
     codes = {name: evaluation.encoders[name] for name in ("full", "without load", "noise")}
-    assert serving(evaluation.replace(encoders=codes)).startswith(
-        "No code should serve as the full observation does. without load comes nearest: it tells "
-    )
+    judged = judge(evaluation.replace(encoders=codes))
+    assert (judged.take, judged.nearest) == (None, "without load")
     full = codes["full"]
     unknown = Score(None, None, None)
     still = {k: ahead.replace(reward=unknown) for k, ahead in full.prediction.items()}
@@ -226,7 +215,7 @@ def test_nothing_is_said_where_it_cannot_be(evaluation):
     assert not re.search(r"noise +nothing", told)
     blind = {k: a.replace(rewarded=unknown, reward=unknown, mean=unknown) for k, a in still.items()}
     nothing = evaluation.replace(encoders=codes | {"full": full.replace(prediction=blind)})
-    assert serving(nothing).startswith("Which code serves can't be said: in these")
+    assert "next to nothing" in judge(nothing).unsaid
     assert evaluation.encoders["without load"].method == {"spectrum": [3.0, 1.0]}
 
 
@@ -239,19 +228,9 @@ def test_the_nearest_code_tells_something_and_lacks_nothing_if_one_does(evaluati
     lost = evaluation.encoders["without load"].loses
     codes = {"full": telling("full", 0.9), "a": telling("noise", 0.4, lost)}
     codes |= {"b": telling("noise", 0.3), "c": telling("noise", 0.05)}
-    told = evaluation_text(evaluation.replace(encoders=codes))
-    assert "observation does. b comes nearest: it tells the change" in told
-    assert re.search(
-        r"\nc +nothing: it can all be read now, but what becomes of it less well", told
-    )
-    del codes["b"]
-    assert "a comes nearest" in serving(evaluation.replace(encoders=codes))
-    del codes["a"]
-    assert serving(evaluation.replace(encoders=codes)) == (
-        "No code should serve as the full observation does: none tells the change of what the "
-        "reward depends on over the next 10 steps with more than an R² of 0.05 (the full one: "
-        "0.90)."
-    )
+    for nearest in ("b", "a", None):
+        assert judge(evaluation.replace(encoders=codes)).nearest == nearest
+        codes.pop(nearest, None)
 
 
 def test_of_short_episodes_as_many_steps_count_as_are_known(evaluation):
@@ -259,13 +238,12 @@ def test_of_short_episodes_as_many_steps_count_as_are_known(evaluation):
         label: known.replace(prediction={k: known.prediction[k] for k in ("1", "5")})
         for label, known in evaluation.encoders.items()
     }
-    told = evaluation_text(evaluation.replace(encoders=shorter), everything=True)
-    assert re.search(r"^Take without idle: it tells the change of .* over the next 5 steps", told)
-    assert "Episodes allow to look 5 steps ahead in place of 10." in told
+    judged = judge(evaluation.replace(encoders=shorter))
+    assert judged.take == "without idle"
+    assert "over 5 steps" in judged.by
     blind = {label: known.replace(prediction={}) for label, known in shorter.items()}
     none = evaluation.replace(encoders=blind, needs={})
-    unsaid = "Which code serves can't be said: episodes are too short to look ahead."
-    assert serving(none) == unsaid
+    assert judge(none).unsaid == "episodes are too short to look ahead"
 
 
 def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkeypatch):

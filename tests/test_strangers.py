@@ -10,7 +10,7 @@ from jbrep.errors import InputError
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import inside, read_regular, write_new, write_note, write_whole
 from jbrep.report import make_report
-from jbrep.report.report import FIGURES, MARKDOWN, PAGE, SUMMARY
+from jbrep.report.report import FIGURES, FINDINGS, MARKDOWN, PAGE
 from jbrep.rl.files import ENCODER, EPISODES, EVALUATIONS, POLICY, POLICY_ZIP
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD
@@ -20,7 +20,7 @@ from jbrep.study.work import ERROR, PROGRESS
 
 TINIEST = TINY.replace(representations=("full",), seeds=(0,))
 OF_A_RUN = (PROGRESS, ERROR, ENCODER, EPISODES, EVALUATIONS, POLICY, POLICY_ZIP)
-OF_A_STUDY = (RECORD, RETURNS, PAGE, SUMMARY, MARKDOWN)
+OF_A_STUDY = (RECORD, RETURNS, PAGE, FINDINGS, MARKDOWN)
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ verdicts go by the rule in results/trainers/README.md.
 
 import sys
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,14 +16,10 @@ from jbrep.errors import InputError
 from jbrep.records.document import read_document
 from jbrep.records.storage import write_whole
 from jbrep.records.tables import read_rows
-from jbrep.report.figures import write
-from jbrep.report.figures.curves import curves
-from jbrep.report.figures.style import styles
 from jbrep.rl.files import FINISHED
-from jbrep.stats import RunCurve, analyse
+from jbrep.stats import RunCurve
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import variance_ratio
-from jbrep.stats.rules import Planned, Rules
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.tables import RETURNS, Return, by_run
 from jbrep.text import rounded, table
@@ -175,10 +170,9 @@ def measured(runs: list[RunCurve]) -> dict[str, Array]:
 
 
 def main(results: Path) -> None:
-    texts, runs = [], []
+    texts = []
     for learner in LEARNERS:
         arms = {arm: read_arm(results / f"{learner}-{arm}", arm) for arm in ARMS}
-        runs += [run for each in arms.values() for run in each]
         usual, rows, verdicts = measured(arms[SB3]), [], []
         for arm in COHORTS:
             its = measured(arms[arm])
@@ -190,8 +184,6 @@ def main(results: Path) -> None:
     text = "\n\n".join(texts) + "\n"
     print(text, end="")
     write_whole(results / SUMMARY, text.encode())
-    groups = analyse(runs, Planned(Rules(baseline=SB3))).groups
-    write([curves(groups, {}, partial(styles, ARMS, SB3))], results / "figures")
 
 
 if __name__ == "__main__":

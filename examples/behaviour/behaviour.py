@@ -1,7 +1,7 @@
 """Draw what policies do: how the motor turns, and where the robot goes (the paper's Figs. 4, 5).
 
-    python examples/behaviour/behaviour.py runs/full runs/dae-4 --out behaviour
-    python examples/behaviour/behaviour.py heuristic uniform --task move_in_direction --out behaviour
+    python examples/behaviour/behaviour.py runs/full runs/dae-4 --out drawn
+    python examples/behaviour/behaviour.py heuristic uniform --task move_in_direction --out drawn
 
 Policies are as `jbrep behaviour` takes them, which prints the same as a table.
 """
@@ -57,6 +57,7 @@ def behaviour_plots(task: str, behaviours: Sequence[Behaviour], target_yaw: floa
 
 
 def motor(behaviours: Sequence[Behaviour]) -> Iterator[Row]:
+    """Shares of time by motor velocity [rad/s]."""
     for each in behaviours:
         for low, high, share in zip(SPEEDS, SPEEDS[1:], each.motor, strict=False):
             yield {"policy": each.name, "low": low, "high": high, "share": share}
@@ -72,6 +73,7 @@ def cells(behaviours: Sequence[Behaviour]) -> Iterator[Row]:
 
 
 def draw_places(behaviours: Sequence[Behaviour], target_yaw: float) -> Figure:
+    """A panel for each policy."""
     rows = -(-len(behaviours) // ACROSS)
     across = -(-len(behaviours) // rows)
     width = COLUMN if across == 1 else PAGE
@@ -105,6 +107,7 @@ def draw_target(axes: Axes, reach: float, yaw: float) -> None:
 
 
 def main() -> None:
+    """Play and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("policies", nargs="+")
     parser.add_argument("--task", help="for policies by name")

@@ -29,7 +29,7 @@ from jbrep.envs import describe
 from jbrep.envs.names import environment_versions
 from jbrep.records.document import read_document
 from jbrep.report import make_report
-from jbrep.report.report import STATISTICS, SUMMARY
+from jbrep.report.report import MARKDOWN
 from jbrep.report.tables import read_tables
 from jbrep.rl import Run
 from jbrep.rl.files import CHECKPOINT, ENCODER, EVALUATIONS, POLICY, RUN
@@ -291,7 +291,7 @@ def _report(study: Path):
 
     def result(folder):
         it = folder / "it"
-        names = (RETURNS, REFERENCE_RETURNS, RECORD, SUMMARY, STATISTICS)
+        names = (RETURNS, REFERENCE_RETURNS, RECORD, MARKDOWN)
         return digest(*(it / name for name in names))
 
     def files(folder):
@@ -385,8 +385,5 @@ SURFACES = {  # by name, what makes them of `Shared`
     "inspect": lambda shared: _of_a_run(shared.run, "inspect run --out it.rrd", "it.rrd", _rows),
     "render": lambda shared: _of_a_run(
         shared.run, "render run --size 64x64 --out it.gif", "it.gif"
-    ),
-    "behaviour": lambda shared: _of_a_run(
-        shared.run, "behaviour run --episodes 1 --out it", "it/*"
     ),
 }
