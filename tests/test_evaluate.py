@@ -1,7 +1,6 @@
 """Diagnostics: against closed forms, other libraries, and sums by hand."""
 
 import json
-import re
 import tracemalloc
 from pathlib import Path
 
@@ -255,7 +254,6 @@ def test_a_wide_robot_can_be_judged(tmp_path):
     for result in evaluation.encoders.values():
         assert set(result.probes["obs_0"]) == {None}  # it is constant
     shown = evaluation_text(evaluation, 100, everything=True)
-    assert re.search(r"probes, mean +worst probe", shown)
     assert max(map(len, shown.splitlines())) <= 100
 
 
@@ -433,7 +431,7 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
     chosen = ("--encoder", "dae-4", "./dae-4", "full")
     command = ("evaluate", *chosen, "--data", collected, "--out", "judged")
     shown = jbrep(*command).stdout
-    assert shown.startswith("Which code serves can't be said: in these 1,000 held-out steps even")
+    assert shown.startswith("Which code serves can't be said: of these 1,000 held-out steps")
     assert "Judged: dae-4, shipped; ./dae-4; full, shipped." in shown
     assert "--all shows" in shown
     assert max(map(len, shown.splitlines())) <= 80

@@ -5,8 +5,6 @@ import json
 import numpy as np
 import pytest
 from command import in_this_process, jbrep, refused
-from jbrep.report.returns import returns_tables
-from jbrep.report.shares import share_cells, shares_of_runs
 from small import flip_bit
 
 from jbrep.envs import describe
@@ -14,7 +12,9 @@ from jbrep.envs.infos import by_name, number_of, numbers_in, shares, shares_text
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.names import import_modules
 from jbrep.report import report
+from jbrep.report.findings import Findings
 from jbrep.report.tables import read_tables
+from jbrep.report.views import returns_tables
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, INFOS, Info, read_infos, read_run
 from jbrep.study.config import Study
@@ -137,7 +137,7 @@ def study(tmp_path_factory):
     assert run_study(plan, in_this_process, 1) == 0
     draw = report.study_plots
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "study_plots", lambda *tables: draw(*tables)[:1])
+        patch.setattr(report, "study_plots", lambda found: draw(found)[:1])
         done = jbrep("report", folder)
     assert done.exit_code == 0, done.output
     return folder, done.stdout
@@ -161,12 +161,12 @@ def test_a_study_has_them_in_a_table_of_its_own(study, tmp_path):
 
 def test_reports_have_a_column_for_each_share(study):
     folder, said = study
-    scored, sledge = returns_tables(read_tables(folder))
+    scored, sledge = returns_tables(Findings.of(read_tables(folder)))
     heads = ("share of is_success", "share of slid")
     assert scored.header[-2:] == heads
     assert [row[-2:] for row in scored.rows] == [("0.50", "0.33"), *[("-", "-")] * 3]
     assert not {*heads} & {*sledge.header}
-    assert all(f"  {head}\n" in said for head in heads)  # in two parts, as 80 columns are few
+    assert all(f"  {head}" in said for head in heads)
     for name in ("report.html", "summary.md"):
         assert heads[0] in (folder / name).read_text()
 
@@ -187,9 +187,12 @@ def test_shares_are_of_last_evaluations_and_have_intervals(study):
     ]
     infos.append(RunInfo(*key, 3, 40, 0, "heat", 0.5))
     tables = tables._replace(record=tables.record.replace(runs=made), returns=returns, infos=infos)
-    label = first.label
-    assert shares_of_runs(tables) == {(label, seed): {"won": (seed + 1) / 5} for seed in range(4)}
-    assert share_cells(tables) == {"share of won": {label: "0.50 [0.16, 0.84]"}}
+    found = Findings.of(tables)
+    assert {run.seed: run.shares for run in found.runs} == {
+        seed: {"won": (seed + 1) / 5} if seed < 4 else {} for seed in range(5)
+    }
+    (agents,) = next(g for g in found.groups if g.task == SCORED).agents
+    assert agents.shares["won"] == pytest.approx((0.5, 0.16, 0.84), abs=0.005)
 
 
 def test_a_run_is_reported_in_its_own_folder(run):

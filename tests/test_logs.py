@@ -21,7 +21,6 @@ import pyarrow.parquet as pq
 import pytest
 from command import jbrep, mistake
 from foreign import GYRO, PITCH, RATE, TIMES, VOLTS, csv_rows, lerobot_folder, write_bag, write_csv
-from jbrep.report.serving import untold
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -44,6 +43,7 @@ from jbrep.envs import describe
 from jbrep.errors import InputError, Notice
 from jbrep.evaluate.diagnosis import diagnose
 from jbrep.methods.fit import Fitter
+from jbrep.report.evaluation import untold
 
 NAMED = ("--observations", "pitch,gyro,ticks", "--actions", "u", "--time", "time")
 

@@ -141,7 +141,7 @@ def test_other_policies_and_data_than_were_registered_are_told(collected, tmp_pa
 
 
 def test_claims_in_a_work_tree_run_once_they_are_committed(repository, tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.report.report.write_report", lambda tables, out: [out])
+    monkeypatch.setattr("jbrep.report.report.write_report", lambda found, out: [out])
     path, out = repository / "it.toml", tmp_path / "out"
     beside = repository / "it.registration.json"
     path.write_text(CLAIMS.toml())

@@ -25,15 +25,15 @@ from command import (
     wait_for_the_end_of,
     workers_of,
 )
-from jbrep.report.statistics import results_text
 from small import adopt, forge
 
 from jbrep.dataset import Dataset
 from jbrep.encoders import load
 from jbrep.envs import describe
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import DamageError, InputError, Notice
 from jbrep.play.sources import find_player, find_untrained
-from jbrep.report.report import statistics
+from jbrep.report.findings import Findings
+from jbrep.report.report import results_text
 from jbrep.report.tables import read_tables
 from jbrep.rl.files import CHECKPOINT, RUN, read_run
 from jbrep.rl.presets import PRESETS, get_preset
@@ -76,7 +76,7 @@ episode_steps = 100
 def tables(folder):
     """The tables of a study, as bytes."""
     write_tables(folder)
-    found = statistics(read_tables(folder).analysis)
+    found = Findings.of(read_tables(folder)).as_json()["groups"]
     return (folder / RETURNS).read_bytes(), json.dumps(found).encode()
 
 
@@ -455,9 +455,9 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     assert (plan.folder_of(begun) / CHECKPOINT).exists()
     reported = jbrep("report", out, "--json")
     assert reported.exit_code == 0, reported.output
-    summary = json.loads(reported.stdout)
-    assert summary == json.loads((out / "summary.json").read_text())
-    assert (len(summary["missing"]), summary["runs"]) == (3, 1)
+    found = json.loads(reported.stdout)
+    assert found == json.loads((out / "findings.json").read_text())
+    assert (len(found["missing"]), len(found["runs"])) == (3, 1)
     assert run_study(plan, in_this_process, 1) == 0
     assert tables(out) == tables(done.folder)
 
@@ -518,7 +518,7 @@ def test_progress_is_a_line_for_each_run_where_there_is_no_terminal(done, capsys
 
 def test_tables_fit_the_terminal(done):
     write_tables(done.folder)
-    assert max(map(len, results_text(read_tables(done.folder), 80).splitlines())) <= 80
+    assert max(map(len, results_text(Findings.of(read_tables(done.folder)), 80).splitlines())) <= 80
 
 
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
@@ -526,7 +526,7 @@ def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     out = shutil.copytree(done.folder, tmp_path / "out")
     shutil.rmtree(Plan(TINY, out).folder_of(done.cells[0]))
     monkeypatch.setattr("jbrep.study.run_study", lambda *given: 1)
-    monkeypatch.setattr("jbrep.report.report.write_report", lambda tables, out: [out])
+    monkeypatch.setattr("jbrep.report.report.write_report", lambda found, out: [out])
     told = jbrep("study", path, "--out", out)
     assert told.exit_code == 1
     assert "Note: 1 run crashed: the same study in that folder tries again\n" in told.stderr
@@ -546,15 +546,15 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     """Its workers import the package; its report is made where that is missing."""
     path, out = written(tmp_path, *MIXED), tmp_path / "mixed"
     with monkeypatch.context() as once:
-        once.setattr("jbrep.report.report.write_report", lambda tables, out: [out])
+        once.setattr("jbrep.report.report.write_report", lambda found, out: [out])
         told = jbrep("study", path, "--out", out, "--workers", 1, "--import", "robots")
     assert told.exit_code == 0, told.output
     monkeypatch.delitem(gymnasium.registry, robots.ID)
     told = jbrep("report", out)
     assert told.exit_code == 0, told.output
     assert f"{robots.ID}/a2c/dae-2" in (out / "report.html").read_text()
-    summary = json.loads((out / "summary.json").read_text())
-    assert (summary["runs"], summary["missing"], summary["failed"]) == (8, [], [])
+    found = json.loads((out / "findings.json").read_text())
+    assert (len(found["runs"]), found["missing"]) == (8, {})
     returns = {task: [] for task in (robots.ID, "face_direction")}
     for task, _, _, _, _, _, each in list(csv.reader((out / RETURNS).read_text().splitlines()))[1:]:
         returns[task].append(float(each))
@@ -587,11 +587,15 @@ def test_references_of_an_environment_that_is_not_here_stay(tmp_path):
     away = describe("face_direction").replace(id="Away/Robot-v0", name="Away/Robot-v0")
     path.write_text(header + "Away/Robot-v0,random,0,1.0\n")
     before = path.read_bytes()
-    sha256 = write_references([(away, 2)], tmp_path, {})
+    with pytest.warns(Notice, match="'random' couldn't be played on Away/Robot-v0: "):
+        sha256 = write_references([(away, 2)], tmp_path, {})
     assert path.read_bytes() == before
     assert read_references(tmp_path, sha256) == {"Away/Robot-v0": {"random": [1.0]}}
     path.write_text(header + "Away/Robot-v0,random,0,2.0\n")
-    with pytest.raises(DamageError, match=r"references\.csv was changed"):
+    with (
+        pytest.warns(Notice, match="couldn't be played"),
+        pytest.raises(DamageError, match=r"references\.csv was changed"),
+    ):
         write_references([(away, 2)], tmp_path, {REFERENCE_RETURNS: sha256})
     assert path.exists()
 

@@ -9,11 +9,7 @@ import numpy as np
 import onnx
 import pytest
 from command import in_this_process, jbrep
-from jbrep.report.facts import encoder_table, outline, reproduce
-from jbrep.report.figures.diagrams import autoencoders
-from jbrep.report.figures.style import styles
 from judged import diagnostics, evaluation
-from made_up import label_of
 from my_encoders import LATENT, SIZE, FirstFeatures, dense
 from small import forge
 from test_convert import model
@@ -28,7 +24,10 @@ from jbrep.errors import DamageError, InputError
 from jbrep.evaluate.evaluation import EVALUATION, Score
 from jbrep.evaluate.table import DIAGNOSTICS, read_diagnostics
 from jbrep.records.record import to_plain
+from jbrep.report.findings import Findings
+from jbrep.report.report import commands
 from jbrep.report.tables import read_tables
+from jbrep.report.views import settings_tables
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.policy import load_run
@@ -219,12 +218,12 @@ def test_different_encoders_under_one_label_are_refused_otherwise(done, tmp_path
 
 
 def test_the_report_tells_of_own_encoders(done):
-    tables = read_tables(done.folder)
-    assert outline(tables).endswith(f"With mine, {EACH_ITS_OWN}.")
-    rows = {row[0].rpartition("/")[2]: row[1:] for row in encoder_table(tables).rows}
+    found = Findings.of(read_tables(done.folder))
+    assert found.own_encoders == ["mine"]
+    rows = {row[0].rpartition("/")[2]: row[1:] for row in settings_tables(found)[1].rows}
     assert rows["mine"][-1] == EACH_ITS_OWN
     assert rows["net"][:4] == (NET, f"{SIZE} - {LATENT}", "-", "-")
-    toml, command = (code for _, code in reproduce(tables)[1:3])
+    toml, command = [*commands(found).values()][1:3]
     assert as_study(tomllib.loads(toml)) == done.study
     assert command == "jbrep study study.toml --out done --import my_encoders"
     assert read_plan(done.folder).study == done.study
@@ -288,7 +287,7 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     ]
     assert told[5:7] == [("random-4-s1", "random-4", 1), ("mine-1", "mine", 1)]
     assert told[9:11] == told[1:3]
-    assert runs["late-4", 0].find_encoder().name == "late-4"
+    assert runs["late-4", 0].find().name == "late-4"
     (exploratory,) = study.replace(seeds=(0, 1)).notices
     assert exploratory.startswith("This study is exploratory")
 
@@ -416,13 +415,6 @@ def test_a_worker_imports_the_modules_it_is_told_to(done, tmp_path, monkeypatch)
     assert "add --import my_encoders" in crashed.message
     ended = work(assigned, modules=["my_encoders"])
     assert ended.status == "finished"
-
-
-def test_a_drawing_of_an_encoder_without_decoder_ends_with_the_latent():
-    mine = label_of(describe(TASK), "mine", [(2, "tanh")]).encoder
-    (axes,) = autoencoders(TASK, {"mine": mine}, lambda: styles(["mine"])).draw().axes
-    assert [text.get_text() for text in axes.texts][2:] == ["observation", "latent"]
-    assert axes.get_title("center") == "mine"
 
 
 def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):

@@ -2,22 +2,21 @@
 
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import jbrep
-from jbrep.report.words import conclusion, told, verdict_cells
-from made_up import SEEDS, STUDY, make_runs, of_a_commit
+from made_up import SEEDS, STUDY, found_of, make_runs, of_a_commit
 from small import adopt
 
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.report import report
+from jbrep.report.findings import Findings
 from jbrep.report.report import write_report
 from jbrep.report.tables import read_tables
-from jbrep.stats.bootstrap import Interval
+from jbrep.report.views import verdict_cells
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD
@@ -36,20 +35,20 @@ def reports(tmp_path_factory):
         register_study(Plan(STUDY, folder))
     found = {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "study_plots", lambda *_: [])
+        patch.setattr(report, "study_plots", lambda found: [])
         for seeds in (8, SEEDS, SEEDS + 2):
             plan = Plan(STUDY.replace(seeds=tuple(range(max(seeds, SEEDS)))), folder)
             plan.write()
             make_runs(plan, range(seeds))
             write_tables(folder)
-            page, _, text, *_ = write_report(read_tables(folder), folder)
-            analysis = read_tables(folder).analysis
-            found[seeds] = analysis, page.read_text(), text.read_text()
+            tables = read_tables(folder)
+            _, page, text, *_ = write_report(Findings.of(tables), folder)
+            found[seeds] = tables.analysis, page.read_text(), text.read_text()
             if seeds == SEEDS:
-                tables = {path.name: path.read_bytes() for path in folder.glob("*.*")}
+                files = {path.name: path.read_bytes() for path in folder.glob("*.*")}
     whole = folder.parent / "whole"
     whole.mkdir()
-    for name, content in tables.items():
+    for name, content in files.items():
         (whole / name).write_bytes(content)
     return folder, found
 
@@ -77,12 +76,16 @@ def test_the_end_says_what_is_true(reports):
     assert 5 / 25 < steady.estimate.value < 0.5  # less than the ends alone, by the time before
     assert earlier.estimate.low < -1500 < earlier.estimate.high
     assert "what ran is what was registered." in text
-    assert "Supported: dae-8 not worse than full (face_direction" in page
+    assert '<td class="text supported">supported</td>' in page
     ends = [group.ends for group in analysis.groups]
     best, *_, last = analysis.aggregates
     assert best.tasks == ("face_direction", "move_in_direction")
     scores = [(500 - each.blind) / (each.top - each.blind) for each in ends]
     assert 1 - last.optimality_gap.value == pytest.approx(np.mean(scores), abs=0.03)
+
+
+def first_verdict(reports):
+    return found_of(reports[1][SEEDS][0]).verdicts[0]
 
 
 @pytest.mark.parametrize(
@@ -96,19 +99,15 @@ def test_the_end_says_what_is_true(reports):
     ],
 )
 def test_no_level_of_an_interval_is_rounded_to_100_percent(reports, level, said):
-    verdict = next(iter(on_face(reports[1][SEEDS][0]).values()))
-    assert verdict_cells(replace(verdict, level=level))["interval"] == f"{said} %"
+    verdict = first_verdict(reports)
+    assert verdict_cells(verdict.replace(level=level))["level"] == f"{said} %"
 
 
 def test_a_verdict_on_a_rising_curve_says_by_when(reports):
-    verdict = next(iter(on_face(reports[1][SEEDS][0]).values()))
-    rising = replace(verdict, by=10_000)
-    assert conclusion([rising]) == "Supported: dae-8 not worse than full (by 10,000 steps)."
+    rising = first_verdict(reports).replace(by=10_000)
     assert verdict_cells(rising)["verdict"] == "supported by 10,000 steps"
-
-
-def test_what_rounds_to_no_steps_has_no_direction():
-    assert told("faster", Interval(-0.4, -1234.5, 0.6)) == "0 [1,234 earlier, 1 later]"
+    undecided = rising.replace(verdict="undecided")
+    assert verdict_cells(undecided)["verdict"] == "undecided"
 
 
 def test_seeds_that_were_added_are_exploratory(reports):

@@ -8,23 +8,20 @@ returns.
 import csv
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jbrep.report.figures.plot import Drawing
-from jbrep.report.figures.style import PAGE, PAPER, reference, styles
-from jbrep.report.words import shown
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jbrep.errors import InputError
 from jbrep.records.storage import write_whole
+from jbrep.report.figures.panels import PAGE, Look, Plot, reference, styles
+from jbrep.report.findings import Agents, Findings, Group
 from jbrep.report.tables import read_tables
-from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, SUPPORTED
-from jbrep.stats.labels import RepresentationResult
+from jbrep.text import interval
 
 ORDER = ("coordinates", "symmetry")  # first; the others as their names are
 INSIDE = {CONTRADICTED: "white", SUPPORTED: None}  # of a mean's marker; None as the rest of it
@@ -42,13 +39,13 @@ class Verdict(NamedTuple):
 class Judged(NamedTuple):
     """A task and the verdicts on *not worse* there, by representation."""
 
-    group: GroupAnalysis
+    group: Group
     verdicts: dict[str, Verdict]
 
     @property
-    def labels(self) -> dict[str, RepresentationResult]:
+    def labels(self) -> dict[str, Agents]:
         """Results by representation."""
-        return {each.representation: each for each in self.group.labels}
+        return {each.representation: each for each in self.group.agents}
 
 
 def read(folder: Path) -> Judged:
@@ -57,10 +54,10 @@ def read(folder: Path) -> Judged:
     Raises:
         InputError: it has several, or nothing was compared; or as `read_tables`.
     """
-    analysis = read_tables(folder).analysis
-    if analysis is None or len(analysis.groups) != 1:
+    groups = Findings.of(read_tables(folder)).groups
+    if len(groups) != 1:
         raise InputError(f"{folder} isn't a study of one task with comparisons")
-    (group,) = analysis.groups
+    (group,) = groups
     with (folder / "verdicts.csv").open(newline="") as file:
         verdicts = {
             row["representation"]: Verdict(
@@ -93,7 +90,7 @@ def rows(studies: Sequence[Judged]) -> Iterator[list[str]]:
 def _cell(study: Judged, name: str) -> str:
     if name not in study.labels:
         return ""
-    returned = shown(study.labels[name].numbers["final_return_mean"], ".0f")
+    returned = interval(study.labels[name].numbers["final_return_mean"], ".0f")
     if name not in study.verdicts:
         return returned
     verdict = study.verdicts[name]
@@ -116,7 +113,7 @@ def draw(studies: Sequence[Judged]) -> Figure:
         for row, name in enumerate(names):
             if name in study.labels:
                 _draw_runs(axes, row, study, name, look[name])
-        axes.axvline(study.group.ends.blind, **reference())
+        axes.axvline(_blind(study), **reference())
         for boundary in {_boundary(study, each) for each in study.verdicts.values()}:
             axes.axvline(boundary, **{**reference(), "linestyle": ":"})
         axes.set_title(study.group.task)
@@ -129,20 +126,23 @@ def draw(studies: Sequence[Judged]) -> Figure:
 
 def _boundary(study: Judged, verdict: Verdict) -> float:
     """The return at which the share of the gain is on the verdict's boundary."""
-    baseline = study.group.labels[0].numbers["final_return_mean"].value
-    blind = study.group.ends.blind
-    return float(blind + verdict.boundary * (baseline - blind))
+    baseline, blind = study.group.agents[0].numbers["final_return_mean"].value, _blind(study)
+    return blind + verdict.boundary * ((baseline or 0.0) - blind)
 
 
-def _draw_runs(axes: Axes, row: int, study: Judged, name: str, style: dict[str, Any]) -> None:
+def _blind(study: Judged) -> float:
+    return study.group.ends["blind"] or 0.0
+
+
+def _draw_runs(axes: Axes, row: int, study: Judged, name: str, style: Look) -> None:
     label, colour = study.labels[name], style["color"]
-    finals = label.by_run["final_return"]
-    axes.plot(finals, [row - 0.22] * len(finals), "|", color=colour, ms=4, alpha=0.5)
-    mean = label.numbers["final_return_mean"]
-    axes.plot([mean.low, mean.high], [row, row], color=colour, linewidth=1.6)
+    finals = np.array(label.by_run["final_return"], float)
+    axes.plot(finals, np.full(len(finals), row - 0.22), "|", color=colour, ms=4, alpha=0.5)
+    mean = np.array(label.numbers["final_return_mean"], float)
+    axes.plot(mean[1:], [row, row], color=colour, linewidth=1.6)
     verdict = study.verdicts.get(name)
     inside = INSIDE.get(verdict.verdict, OPEN) if verdict else None
-    place = ([mean.value], [row], style["marker"])
+    place = (mean[:1], [row], style["marker"])
     axes.plot(*place, color=colour, ms=4.5, markerfacecolor=inside or colour)
 
 
@@ -151,7 +151,8 @@ def main(out: str, *folders: str) -> None:
     head, *body = rows(studies)
     for row in (head, ["---"] * len(head), *body):
         print(f"| {' | '.join(row)} |")
-    write_whole(Path(out), Drawing(partial(draw, studies), PAPER).picture("png"))
+    plot = Plot("answer", "", "", [], lambda _: draw(studies))
+    write_whole(Path(out), plot.picture("png"))
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from jbrep.evaluate.evaluation import Evaluation
 from jbrep.records.document import read_document
 from jbrep.report import write_report
 from jbrep.report.figures import encoder_plots, write
+from jbrep.report.findings import Findings
 from jbrep.report.tables import read_tables
 
 RESULTS = Path("results")
@@ -14,7 +15,7 @@ RESULTS = Path("results")
 
 def draw(tables: Path) -> list[Path]:
     if tables.name == "runs.json":
-        return write_report(read_tables(tables.parent), tables.parent)
+        return write_report(Findings.of(read_tables(tables.parent)), tables.parent)
     return write(encoder_plots(read_document(tables, Evaluation)), tables.parent)
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
-from jbrep.report.words import shown
 from joblib import cpu_count
 
 from jbrep.play.sources import find_player
@@ -24,7 +23,7 @@ from jbrep.rl.files import RunRecord, read_run, runs_below
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within, share_of_gain
 from jbrep.stats.scale import best_blind
 from jbrep.study.tables import references_of
-from jbrep.text import table
+from jbrep.text import interval, table
 from jbrep.training.trainer import single_torch_thread
 
 BASELINE = "coordinates"
@@ -85,9 +84,9 @@ def cells(known: pd.DataFrame, bounds: Bounds) -> Iterator[tuple[str, str, str]]
     assert blind
     for name in sorted(finals, key=lambda name: (name != BASELINE, name)):
         x, y = finals[[name, BASELINE]].dropna().to_numpy(float).T  # of the seeds of both
-        share = shown(share_of_gain(x, y, by_policy[blind], LEVEL), ".2f")
+        share = interval(share_of_gain(x, y, by_policy[blind], LEVEL).tolist(), ".2f")
         own = finals[name].dropna().to_numpy(float)
-        mean = shown(mean_within(own, bounds, LEVEL), ".0f")
+        mean = interval(mean_within(own, bounds, LEVEL).tolist(), ".0f")
         yield name, mean, "" if name == BASELINE else share
     for policy, value in by_policy.items():
         yield policy, f"{value:.0f}", ""

@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jbrep.report.serving import good_codes, recommended
 
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.table import headline
 from jbrep.records.document import read_document
+from jbrep.report.evaluation import judge
 from jbrep.report.tables import Tables, read_tables
 from jbrep.stats.association import correlation_of_ranks, over_families
 from jbrep.stats.bootstrap import Array, Interval
@@ -94,8 +94,8 @@ def read(folder: Path) -> Scored:
         families=[kinds[code] for code in codes],
         pairs=pairs,
         returns=finals.mean(1),
-        good=good_codes(evaluation),
-        taken=recommended(evaluation),
+        good=[*judge(evaluation).serving],
+        taken=judge(evaluation).take,
     )
 
 

@@ -209,6 +209,45 @@ class Findings(Document, frozen=True, kw_only=True):
     study: str | None  # its file
     imports: list[str]  # modules of its own robots and encoders
 
+    @classmethod
+    def of(cls, tables: Tables) -> "Findings":
+        """What the tables of a study say."""
+        record, analysis, runs = tables.record, tables.analysis, _runs(tables)
+        labels, planned = record.labels, record.planned
+        settings = [label.settings for label in labels.values()]
+        own = (each.representation for each in settings if each.encoder == EACH_ITS_OWN)
+        top = planned.rules.top
+        return cls(
+            name=tables.name,
+            title=(record.study.title if record.study else "") or tables.name,
+            tasks=[*record.tasks],
+            algorithms=[*dict.fromkeys(each.learner for each in settings)],
+            representations=in_order((each.representation for each in settings), FULL),
+            own_encoders=in_order(own, FULL),
+            baseline=analysis.baseline if analysis else record.baseline,
+            top=top if isinstance(top, str) else "",
+            is_study=record.study is not None,
+            registration=record.registration,
+            comparisons=len(planned.rules.chains) * len(planned.groups),
+            error=planned.rules.error,
+            planned_seeds=len(planned.seeds),
+            scaling=_scaling([*labels.values()]),
+            missing=record.missing,
+            left_out=tables.left_out,
+            not_played=sorted({*record.tasks} - {*tables.references}),
+            verdicts=to_plain(analysis.verdicts) if analysis else [],
+            groups=groups_of(analysis, runs, _in_training(tables)) if analysis else [],
+            aggregates=to_plain(analysis.aggregates) if analysis else [],
+            diagnostics=[*_diagnosed(tables, analysis)] if analysis else [],
+            runs=runs,
+            versions=record.versions,
+            processors=record.processors,
+            encoders=[{"runs": label, **_encoder(shared)} for label, shared in labels.items()],
+            settings=_settings(tables),
+            study=record.study.toml().rstrip() if record.study else None,
+            imports=_imports(tables),
+        )
+
     @property
     def failed(self) -> list[RunFound]:
         """Runs that failed."""
@@ -221,45 +260,6 @@ class Findings(Document, frozen=True, kw_only=True):
 
     def text(self) -> str:
         return json.dumps(self.as_json(), indent=self.indent, allow_nan=False) + "\n"
-
-
-def find(tables: Tables) -> Findings:
-    """What the tables of a study say."""
-    record, analysis, runs = tables.record, tables.analysis, _runs(tables)
-    labels, planned = record.labels, record.planned
-    settings = [label.settings for label in labels.values()]
-    own = (each.representation for each in settings if each.encoder == EACH_ITS_OWN)
-    top = planned.rules.top
-    return Findings(
-        name=tables.name,
-        title=(record.study.title if record.study else "") or tables.name,
-        tasks=[*record.tasks],
-        algorithms=[*dict.fromkeys(each.learner for each in settings)],
-        representations=in_order((each.representation for each in settings), FULL),
-        own_encoders=in_order(own, FULL),
-        baseline=analysis.baseline if analysis else record.baseline,
-        top=top if isinstance(top, str) else "",
-        is_study=record.study is not None,
-        registration=record.registration,
-        comparisons=len(planned.rules.chains) * len(planned.groups),
-        error=planned.rules.error,
-        planned_seeds=len(planned.seeds),
-        scaling=_scaling([*labels.values()]),
-        missing=record.missing,
-        left_out=tables.left_out,
-        not_played=sorted({*record.tasks} - {*tables.references}),
-        verdicts=to_plain(analysis.verdicts) if analysis else [],
-        groups=groups_of(analysis, runs, _in_training(tables)) if analysis else [],
-        aggregates=to_plain(analysis.aggregates) if analysis else [],
-        diagnostics=[*_diagnosed(tables, analysis)] if analysis else [],
-        runs=runs,
-        versions=record.versions,
-        processors=record.processors,
-        encoders=[{"runs": label, **_encoder(shared)} for label, shared in labels.items()],
-        settings=_settings(tables),
-        study=record.study.toml().rstrip() if record.study else None,
-        imports=_imports(tables),
-    )
 
 
 def groups_of(

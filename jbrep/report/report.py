@@ -16,7 +16,7 @@ from jbrep.records.storage import exists, make_folder, write_whole
 from jbrep.report import views
 from jbrep.report.figures import Plot, study_plots, write
 from jbrep.report.figures.panels import PAGE as WHOLE
-from jbrep.report.findings import Findings, find
+from jbrep.report.findings import Findings
 from jbrep.report.tables import Tables, check_tables, read_tables
 from jbrep.study.results import has_runs, write_tables
 from jbrep.study.tables import Return, add_diagnostics
@@ -94,7 +94,7 @@ def make_report(
             write_tables(folder)
         notes = add_diagnostics(folder, evaluations)
         tables = read_tables(folder)
-        found = find(tables)
+        found = Findings.of(tables)
         return Report(out, tables, found, notes, write_report(found, out))
 
 

@@ -11,6 +11,7 @@ from jbrep.encoders.vec_env import agent_spaces
 from jbrep.records import container
 from jbrep.records.tables import write_rows
 from jbrep.report.figures.panels import PAPER
+from jbrep.report.findings import Findings, RunFound, groups_of
 from jbrep.rl.agent import Spaces, make_agent, parameters
 from jbrep.rl.checkpoint import Header
 from jbrep.rl.files import (
@@ -26,6 +27,7 @@ from jbrep.rl.files import (
 from jbrep.rl.learner import Learner
 from jbrep.rl.overrides import check_shape
 from jbrep.rl.training import packages
+from jbrep.stats.analysis import to_plain
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import EncoderFacts, Label, LabelSettings
@@ -82,6 +84,34 @@ def returns_of(runs):
         for step, episodes in zip(run.steps, run.returns, strict=True)
         for i, each in enumerate(episodes)
     ]
+
+
+def found_of(analysis, runs=(), in_training=None, **changes):
+    """The findings of an analysis, with nothing of how the runs were made."""
+    lists = ("own_encoders", "left_out", "not_played", "diagnostics", "versions", "processors")
+    about = {name: [] for name in (*lists, "encoders", "imports")}
+    about |= {"name": "x", "title": "x", "baseline": analysis.baseline, "top": "", "error": 0.05}
+    about |= {"is_study": False, "registration": None, "comparisons": 0, "planned_seeds": 0}
+    about |= {"scaling": None, "study": None, "missing": {}, "settings": {}}
+    groups = groups_of(analysis, in_training=in_training or {})
+    agents = [each for group in groups for each in group.agents]
+    told = {
+        "tasks": [*dict.fromkeys(group.task for group in groups)],
+        "algorithms": [*dict.fromkeys(group.algorithm for group in groups)],
+        "representations": [*dict.fromkeys(each.representation for each in agents)],
+        "verdicts": to_plain(analysis.verdicts),
+        "aggregates": to_plain(analysis.aggregates),
+    }
+    ended = [
+        RunFound(
+            **{"label": f"{run.task}/{run.algorithm}/{run.representation}", "seed": run.seed},
+            **{"status": "finished", "reason": None, "steps": 1, "minutes": 1.0, "shares": {}},
+            curve=[*zip(run.steps.tolist(), run.returns.mean(axis=1).tolist(), strict=True)],
+            returns=run.returns[-1].tolist() if len(run.steps) else [],
+        )
+        for run in runs
+    ]
+    return Findings(**{**about, **told, "groups": groups, "runs": ended, **changes})
 
 
 def drawn(plot):

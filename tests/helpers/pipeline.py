@@ -12,7 +12,7 @@ import pytest
 from command import in_this_process, jbrep, start, wait_for, wait_for_the_end_of, workers_of
 from small import contents
 
-from jbrep.report.report import STATISTICS, SUMMARY
+from jbrep.report.report import MARKDOWN
 from jbrep.study.runner import BACKENDS
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
 
@@ -55,7 +55,7 @@ def in_peace(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(BACKENDS, "local", in_this_process)
         with pytest.MonkeyPatch.context() as once:
-            once.setattr("jbrep.report.report.write_report", lambda tables, out: [out])
+            once.setattr("jbrep.report.report.write_report", lambda found, out: [out])
             said = {stage: jbrep(*given).output for stage, given in stages(folder).items()}
         return said | {"report": jbrep("report", folder / "study").output}
 
@@ -96,7 +96,7 @@ def ends(folder):
     """All bytes that kills must not change."""
     made = "study/encoders/face_direction/dae-4.safetensors"
     names = ["encoders/dae-4.safetensors", made]
-    names += [f"study/{name}" for name in (RETURNS, STATISTICS, SUMMARY)]
+    names += [f"study/{name}" for name in (RETURNS, REFERENCE_RETURNS, MARKDOWN)]
     names += sorted(str(path.relative_to(folder)) for path in folder.rglob("episodes.csv"))
     return contents(folder / "data") | {name: (folder / name).read_bytes() for name in names}
 

@@ -28,7 +28,7 @@ from jbrep.envs import describe
 from jbrep.envs.names import environment_versions
 from jbrep.records.document import read_document
 from jbrep.report import make_report
-from jbrep.report.report import STATISTICS, SUMMARY
+from jbrep.report.report import MARKDOWN
 from jbrep.report.tables import read_tables
 from jbrep.rl import Run, Session, train
 from jbrep.rl.checkpoint import Checkpoint
@@ -280,7 +280,7 @@ def _report(study: Path):
 
     def result(folder):
         it = folder / "it"
-        names = (RETURNS, REFERENCE_RETURNS, RECORD, SUMMARY, STATISTICS)
+        names = (RETURNS, REFERENCE_RETURNS, RECORD, MARKDOWN)
         return digest(*(it / name for name in names))
 
     def files(folder):
