@@ -12,13 +12,16 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from command import in_this_process
+from small import ONE_EACH
 
 from jbrep.envs.description import describe
 from jbrep.evaluate import regression
 from jbrep.play.sources import find_player
+from jbrep.rl import Run, train
 from jbrep.rl.controller import load_policy
 from jbrep.rl.export import export
 from jbrep.rl.shipped import find
@@ -28,6 +31,7 @@ OWN = Path("examples/own/own.py").resolve()
 ROBOT = Path("examples/robot").resolve()
 LOG = Path("examples/log/notebook.py").resolve()
 JUMP = Path("examples/jump").resolve()
+PAPER = Path("examples/paper/behaviour.py").resolve()
 SITE = Path("tools/site.py").resolve()
 
 
@@ -43,7 +47,7 @@ def test_everything_that_one_can_bring(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("MINARI_DATASETS_PATH", "")
     runpy.run_path(str(OWN), run_name="__main__")
     told = capfd.readouterr().out
-    assert "the module and the file from ONNX give equal tables" in told
+    assert "the module and the file from ONNX give equal codes" in told
     assert "the data set that has grown equals the one collected at once" in told
     for made in ("study/report.html", "mine.rrd", "pendulum-encoders/pca-2.safetensors"):
         assert (tmp_path / "out" / made).stat().st_size > 1000, made
@@ -152,12 +156,23 @@ def test_a_late_answer_does_not_stay_late(monkeypatch):
         assert (action.tolist(), is_late) == ([np.float32(0.3)], True)
 
 
-def test_what_policies_do_is_drawn(tmp_path, monkeypatch, capsys):
-    policies = ("heuristic", "constant:drive=0.5", "--task", "move_in_direction")
-    out = tmp_path / "drawn"
-    monkeypatch.setattr(sys, "argv", ["x", *policies, "--episodes", "2", "--out", str(out)])
-    runpy.run_path("examples/behaviour/behaviour.py", run_name="__main__")
-    assert capsys.readouterr().out.split() == [
-        str(out / f"{name}.png") for name in ("motor_velocity", "positions")
-    ]
-    assert (out / "positions.csv").read_text().startswith("policy,x,y,share\nheuristic,")
+def test_behaviour_of_policies_is_tabled_and_drawn(tmp_path, monkeypatch, capsys):
+    """A constant drive turns the motor one way; the heuristic goes where the target points."""
+    task = describe("move_in_direction", max_episode_steps=1000)
+    train(Run.of(task, "a2c", steps=80, preset="paper", **ONE_EACH), tmp_path / "run")
+    policies = ["constant:drive=0.5", "heuristic", str(tmp_path / "run")]
+    options = "--task", "move_in_direction", "--episodes", "2", "--target-yaw", "30"
+    monkeypatch.setattr(sys, "argv", [str(PAPER), *policies, *options, "--out", str(tmp_path)])
+    runpy.run_path(str(PAPER), run_name="__main__")
+    names = ("motor_velocity", "positions")
+    motor, places = (pd.read_csv(tmp_path / f"{name}.csv") for name in names)
+    assert {*motor.policy} == {*policies[:2], "run", "run, before training"}
+    assert motor.groupby("policy").share.sum().to_numpy() == pytest.approx([1] * 4)
+    assert places.groupby("policy").share.sum().to_numpy() == pytest.approx([1] * 4)
+    one_way = motor[(motor.policy == policies[0]) & (motor.low > 50)]
+    assert one_way.share.sum() > 0.9  # 145 rad/s at full drive
+    ours = places[places.policy == "heuristic"]
+    x, y = (ours[each] @ ours.share for each in "xy")
+    assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(30, abs=14)
+    assert capsys.readouterr().out.count("mean place") == 4
+    assert (tmp_path / "positions.png").stat().st_size > 1000

@@ -13,8 +13,6 @@ from made_up import drawn, found_of
 from matplotlib.text import Text
 from PIL import Image
 
-from jbrep.envs import describe
-from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import (
     Evaluation,
     FeatureError,
@@ -22,7 +20,6 @@ from jbrep.evaluate.evaluation import (
     Reconstruction,
     Score,
 )
-from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, observe
 from jbrep.records.document import read_document
 from jbrep.report.figures import encoder_plots, study_plots, write
 from jbrep.report.figures.panels import COLUMN, PAGE, PAPER, fitting, line, panels, styles
@@ -310,7 +307,9 @@ def test_a_profile_falls_from_all_runs_to_none(plots, found):
         assert np.all(np.diff(shares) <= 0)
         key = {"task": group.task, "algorithm": group.algorithm, "representation": "full"}
         assert values(plots["profiles"], "value", **key) == shares
-    assert {row["task"] for row in plots["profiles"].rows if row["number"] == "score"} == {"2 tasks"}
+    assert {row["task"] for row in plots["profiles"].rows if row["number"] == "score"} == {
+        "2 tasks"
+    }
 
 
 def test_without_statistics_the_runs_are_drawn_all_the_same(found):
@@ -396,42 +395,6 @@ def test_diagnostics_stand_against_final_returns(found):
     mine, error = drawn(plot).axes
     assert mine.lines[1].get_xydata().tolist() == [[0.5, 500.0]]
     assert error.get_xlim()[0] > error.get_xlim()[1]
-
-
-@pytest.fixture(scope="module")
-def behaviours():
-    sources = ("constant:drive=0.5", "heuristic")
-    return observe(sources, describe("move_in_direction"), episodes=3, target_yaw=np.pi / 6)[1]
-
-
-def test_a_constant_drive_turns_the_motor_one_way(behaviours):
-    constant, heuristic = behaviours
-    middles = (SPEEDS[1:] + SPEEDS[:-1]) / 2
-    assert constant.motor.sum() == pytest.approx(1)
-    assert constant.motor[middles > 50].sum() > 0.9  # 145 rad/s at full drive
-    assert fast_shares(constant) == pytest.approx(
-        (0, constant.motor[middles > FAST].sum()), abs=1e-12
-    )
-    assert heuristic.motor[middles < -20].sum() > 0.2
-    assert heuristic.motor[middles > 20].sum() > 0.2
-
-
-def test_the_heuristic_goes_where_the_target_points(behaviours):
-    _, heuristic = behaviours
-    assert heuristic.places.sum() == pytest.approx(1)
-    x, y = heuristic.mean_place
-    assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(30, abs=14)
-    middles = (heuristic.edges[1:] + heuristic.edges[:-1]) / 2
-    shares = heuristic.places.sum(axis=1), heuristic.places.sum(axis=0)
-    np.testing.assert_allclose([share @ middles for share in shares], (x, y), atol=0.01)
-    assert len(heuristic.returns) == 3
-
-
-def test_the_task_of_a_policy_is_needed_and_no_data_set():
-    with pytest.raises(InputError, match="face_direction is a data set: give the folder of a"):
-        observe(("data/sample/face_direction",), None, 1, 0)
-    with pytest.raises(InputError, match="policy heuristic needs a --task"):
-        observe(("heuristic",), None, 1, 0)
 
 
 def scores(quality):

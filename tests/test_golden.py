@@ -83,7 +83,7 @@ def test_what_encoders_keep(folder):
     assert full["probes"]["heading"][0] == pytest.approx(0.503, abs=0.01)
     assert pca["probes"]["motor_phase"][0] == pytest.approx(0.3345, abs=0.01)
     assert dae["probes"]["uprightness"][0] == pytest.approx(0.290, abs=0.05)
-    assert full["dynamics"]["linear"][0] == pytest.approx(0.7123, abs=0.01)
+    assert full["scores"]["next"][0] == pytest.approx(0.7123, abs=0.01)
 
 
 def test_a_run(folder):

@@ -202,7 +202,7 @@ def test_deepmdp_keeps_its_functions_smooth(data):
 @pytest.mark.parametrize(
     ("kind", "settings", "said"),
     [
-        ("forward", {"changes": 0, "values": 0, "reward": 0}, "nothing to predict"),
+        ("forward", {"changes": 0, "values": 0, "reward": 0}, "is to predict varies"),
         ("forward", {"horizons": "1,1000"}, "no held-out episode of .* has more than 1,000 steps"),
         ("self-prediction", {"latent": 1}, "at least 2"),
         ("deepmdp", {"reward": 0}, "above 0"),

@@ -10,7 +10,6 @@ import gymnasium
 import pytest
 from command import in_this_process, jbrep
 
-from jbrep import worth
 from jbrep.evaluate import regression
 from jbrep.study.runner import BACKENDS
 
@@ -21,7 +20,6 @@ LESS = {  # by command: numbers in place of a page's, or beside them
     "train-encoder": {},
     "rl": {"--steps": "200", "--evaluation-episodes": "1", "--episode-steps": "100"},
     "tune": {"--steps": "1100", "--trials": "1", "--evaluation-episodes": "1"},
-    "behaviour": {"--episodes": "2"},
     "render": {"--seconds": "0.5", "--size": "64x64"},
     "evaluate-policy": {"--episodes": "2"},
 }
@@ -88,16 +86,21 @@ def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
         assert (tmp_path / made).stat().st_size, made
 
 
+@pytest.mark.usefixtures("one_figure")
 @pytest.mark.filterwarnings("ignore")  # of very short runs
 def test_ten_minutes_lead_from_a_robot_to_a_code(tmp_path, monkeypatch):
-    for where, less in ((worth, "STEPS"), (regression, "_STEPS")):
-        monkeypatch.setattr(where, less, 100)
-    monkeypatch.setattr(worth, "RUNS", 1)
+    """By the data alone, and by a study of small agents."""
+    monkeypatch.setitem(BACKENDS, "local", in_this_process)
+    monkeypatch.setattr(regression, "_STEPS", 100)
     monkeypatch.chdir(tmp_path)
-    told = [jbrep(*words) for words in map(lessened, commands("docs/worth.md")[:6])]
-    assert [each.exit_code for each in told] == [0] * 6, told
-    judged = told[-2].output
-    assert "Mean return of small agents, 1 of 100 steps each, in 20 episodes" in judged
+    (study,) = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs/worth.md").read_text(), re.M | re.S)
+    short = {"seeds": "1", "steps": "100", "evaluate_every": "100", "final_episodes": "2"}
+    for key, value in short.items():  # of [data], too
+        study = re.sub(rf"^{key} = .*$", f"{key} = {value}", study, flags=re.M)
+    (tmp_path / "choice.toml").write_text(study)
+    told = [jbrep(*words) for words in map(lessened, commands("docs/worth.md"))]
+    assert [each.exit_code for each in told] == [0] * len(told), told
+    assert re.search(r"(Take|No code|Which code)", told[4].output)
     for code in ("full", "forward-6", "forward-4", "pca-6", "slow-6"):
-        assert re.search(rf"^{code} +-\d+\.?\d* \[-\d.* -\d", judged, re.M), judged
+        assert re.search(rf"^{code} +1 +-", told[-1].output, re.M)
     assert (tmp_path / "runs/arm/run.json").stat().st_size

@@ -18,7 +18,6 @@ from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.play.behaviour import observe
 from jbrep.play.jitterbug import read, reward_terms
 from jbrep.play.player import Player
 from jbrep.play.rollout import replay
@@ -257,8 +256,3 @@ def test_returns_of_any_size_and_sign_are_told():
     pytest.importorskip("shimmy")
     small = jbrep("evaluate-policy", "uniform", "--task", "dm_control/cheetah-run-v0", *told).output
     assert re.search(r": median return 0\.\d+ \[0\.\d+, 0\.\d+\] ", small)
-
-
-def test_behaviour_is_the_jitterbugs():
-    with pytest.raises(InputError, match="uniform is of Pendulum-v1: only the Jitterbug's tasks"):
-        observe(["uniform"], short("Pendulum-v1"), 1, 0.0)

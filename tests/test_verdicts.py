@@ -169,7 +169,7 @@ def test_rules_that_do_not_fit_the_study(changes, field):
 
 
 def test_a_dry_run_tells_what_could_be_found(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.study.packing.estimate", lambda runs: 60)
+    monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
     (tmp_path / "it.toml").write_text(STUDY.toml())
     told = jbrep("study", tmp_path / "it.toml", "--dry-run", "--out", tmp_path / "out")
     assert told.exit_code == 0, told.output

@@ -7,7 +7,7 @@ from jbrep.cli.data import collect, data
 from jbrep.cli.encoders import encoder, evaluate
 from jbrep.cli.environment import env
 from jbrep.cli.inspect import inspect
-from jbrep.cli.policies import behaviour, evaluate_policy, policies
+from jbrep.cli.policies import evaluate_policy, policies
 from jbrep.cli.policy import policy
 from jbrep.cli.render import render
 from jbrep.cli.rl import rl, tune
@@ -45,6 +45,6 @@ def doctor(context: click.Context) -> None:
 
 for _command in (
     *(env, collect, data, train_dae, train_encoder, evaluate, encoder, rl, tune, policies, policy),
-    *(evaluate_policy, behaviour, study, report, inspect, render, doctor),
+    *(evaluate_policy, study, report, inspect, render, doctor),
 ):
     main.add_command(_command)

@@ -16,7 +16,7 @@ from jbrep.cli.environment import (
     task_option,
     threads_option,
 )
-from jbrep.cli.output import echo_json, echo_paths, echo_text, say, tell
+from jbrep.cli.output import echo_json, echo_paths, say, tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
@@ -174,10 +174,10 @@ def _perturb(
 ) -> None:
     """Show the rows of a table as they are finished, and write those so far."""
     from jbrep.play.perturbed import HEADER, Table, domains_of, perturb
-    from jbrep.records.storage import check_writable
+    from jbrep.records.storage import make_folder
 
     if out:
-        check_writable(out.parent)
+        make_folder(out.parent)
     domains, lacking = domains_of(player.task, chosen)
     if lacking and not chosen:
         told = f"{player.task.name} has no {', '.join(lacking)} that could be changed"
@@ -331,50 +331,3 @@ def policies(as_json: bool) -> None:
     episodes = len(ships[0].returns[SHIPPED])
     click.echo(f"\nreturns: median [10 %, 90 %] of the same {episodes} episodes")
     return tell("falling: the preset wide, but with a learning rate that falls to 0")
-
-
-@click.command(epilog="Example: jbrep behaviour runs/full runs/dae-4")
-@click.argument("policies", nargs=-1, required=True)
-@task_option
-@click.option(
-    "--episodes", default=100, show_default=True, type=POSITIVE, help="Of each run or policy."
-)
-@click.option(
-    "--target-yaw", default=45.0, show_default=True, help="Where every target points [degrees]."
-)
-@environment_options
-def behaviour(policies: tuple[str, ...], episodes: int, target_yaw: float, **options: Any) -> None:
-    """Show how policies turn the motor and where they go.
-
-    For the Jitterbug's tasks alone. A policy is the folder of a run, shown before and after
-    training; a folder with several runs, which count as one; or a name, such as heuristic. All play
-    the same episodes. examples/behaviour draws both.
-    """
-    import numpy as np
-
-    from jbrep.play.behaviour import FAST, fast_shares, observe
-    from jbrep.play.sources import check_source
-    from jbrep.records.storage import exists
-
-    if not np.isfinite(target_yaw):
-        raise InputError(f"--target-yaw is {target_yaw}: it must be a number of degrees")
-    yaw, task = np.deg2rad(target_yaw), given_task(options)
-    for policy in policies:
-        if not exists(policy):
-            check_source(policy)
-    with stoppable("the same command starts again"):
-        _, behaviours = observe(policies, task, episodes, yaw)
-    header = (
-        *("policy", "return [10, 90 %]", f"motor < -{FAST:g} rad/s", f"> {FAST:g} rad/s"),
-        "mean x, y [m]",
-    )
-    rows = [
-        (
-            each.name,
-            interval_of(each.returns),
-            *(f"{100 * share:.0f} %" for share in fast_shares(each)),
-            "{:z.2f}, {:z.2f}".format(*each.mean_place),
-        )
-        for each in behaviours
-    ]
-    echo_text(table(header, rows, terminal_width()))

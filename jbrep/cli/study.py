@@ -1,7 +1,5 @@
 """Studies: many agents, and what the statistics say of them."""
 
-from collections import Counter
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +15,7 @@ if TYPE_CHECKING:
     from jbrep.report.report import Report
     from jbrep.report.views import Cells
     from jbrep.stats.rules import Planned
-    from jbrep.study.packing import Forecast
+    from jbrep.study.forecast import Forecast
 
 _COUNT = click.IntRange(1, 1024)
 
@@ -29,11 +27,6 @@ _COUNT = click.IntRange(1, 1024)
     "--workers",
     type=_COUNT,
     help="Processes at a time.  [default: one for each core; one if it learns on a GPU]",
-)
-@click.option(
-    "--width",
-    type=_COUNT,
-    help="The most agents that learn together in a process.  [default: what keeps all busy]",
 )
 @click.option(
     "--backend",
@@ -56,7 +49,6 @@ def study(
     study: Path,
     out: Path | None,
     workers: int | None,
-    width: int | None,
     backend: str,
     dry_run: bool,
     register: bool,
@@ -74,8 +66,8 @@ def study(
 
     if dry_run and register:
         raise InputError("--dry-run and --register exclude each other: choose one")
-    if register and (workers or width or backend != "local"):
-        raise InputError("--register runs nothing: leave out --workers, --width and --backend")
+    if register and (workers or backend != "local"):
+        raise InputError("--register runs nothing: leave out --workers and --backend")
     if not exists(study):
         raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)
@@ -86,33 +78,30 @@ def study(
         raise InputError("--dry-run forecasts this machine alone: leave out --backend")
     folder = out or Path("runs") / study.stem
     if dry_run or register:
-        _announce(study, folder, dry_run, workers, width)
+        _announce(study, folder, dry_run, workers)
         return
     from jbrep import api
 
     with stoppable(RESUMES):
-        made = api.study(study, folder, workers=workers, width=width, backend=backend)
+        made = api.study(study, folder, workers=workers, backend=backend)
     _show(made)
     context.exit(bool(made.tables.record.missing))
 
 
-def _announce(
-    path: Path, folder: Path, dry_run: bool, workers: int | None, width: int | None
-) -> None:
+def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> None:
     """Say what a study is going to do, or write it down before the first run."""
-    from jbrep.records.document import read_document
     from jbrep.study import Plan, read_study, register_study
-    from jbrep.study.packing import forecast
-    from jbrep.study.registration import Registration
+    from jbrep.study.forecast import forecast
+    from jbrep.study.registration import registration_in
 
     plan = Plan(read_study(path), folder, path)
-    expected = forecast(plan, workers, width) if dry_run else None
+    expected = forecast(plan, workers) if dry_run else None
     for notice in plan.study.notices:
         tell(notice, err=True)
     if expected:
         return click.echo(_forecast_text(expected, plan.study.planned, terminal_width()))
     registered = register_study(plan)
-    found = read_document(registered, Registration)
+    found = registration_in(registered)
     click.echo(f"registered on {found.date} (SHA-256 {found.sha256})")
     if plan.in_git:
         tell(f"Commit {registered.name}, then run the study: before, it is refused.", err=True)
@@ -124,15 +113,13 @@ def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
     from jbrep.report.views import in_text, probability, say
     from jbrep.stats.power import BETTER_BY, EARLIER_BY, SDS
 
-    sizes = Counter(cohort for _, cohort, _ in forecast.runs)
-    to_go: dict[str, list[tuple[int, float]]] = {}
-    for cell, cohort, seconds in forecast.runs:
-        to_go.setdefault(cell.label, []).append((sizes[cohort], seconds))
+    to_go: dict[str, list[float]] = {}
+    for cell, seconds in forecast.runs:
+        to_go.setdefault(cell.label, []).append(seconds)
     runs: Cells = {
         "agents": lambda item: item[0],
         "runs": lambda item: str(len(item[1])),
-        "at once": lambda item: _range(str(size) for size, _ in sorted(item[1])),
-        "time": lambda item: _range(duration(each) for each in sorted(s for _, s in item[1])),
+        "time of each": lambda item: duration(max(item[1])),
     }
     made_first: Cells = {
         "made first": lambda cost: cost.what,
@@ -150,7 +137,8 @@ def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
         "unseen": lambda each: f"{100 * each.unseen:.0f} %",
     }
     parts: list[str | Table] = [Table.of("", to_go.items(), runs)] if to_go else []
-    parts.append(say("forecast", forecast, duration(forecast.seconds), duration(forecast.elapsed)))
+    on_one_core = sum(seconds for _, seconds in forecast.runs)
+    parts.append(say("forecast", forecast, duration(on_one_core), duration(forecast.elapsed)))
     parts += [Table.of("", forecast.made_first, made_first)] if forecast.made_first else []
     if forecast.prospects:
         count = len(planned.rules.chains) * len(planned.groups)
@@ -158,11 +146,6 @@ def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
         parts.append(say("rules", count, planned.rules.error, len(planned.seeds)))
         parts.append(say("power", SDS, BETTER_BY, EARLIER_BY))
     return "\n\n".join(in_text(part, width) for part in parts)
-
-
-def _range(values: Iterable[str]) -> str:
-    first, *others = dict.fromkeys(values)
-    return f"{first} to {others[-1]}" if others else first
 
 
 @click.command(epilog="Example: jbrep report runs/demo")
@@ -174,9 +157,6 @@ def _range(values: Iterable[str]) -> str:
     help="From jbrep evaluate, of encoders of these runs: its diagnostics go into the tables. "
     "{task} in it stands for each task. May be repeated.",
 )
-@click.option(
-    "--across-trainers", is_flag=True, help="Compare runs of different trainers or precisions, too."
-)
 @click.option("--out", type=PATH, help="A folder for it.  [default: the study's own]")
 @click.option("--all", "everything", is_flag=True, help="Print every table; the page has them.")
 @import_option
@@ -184,7 +164,6 @@ def _range(values: Iterable[str]) -> str:
 def report(
     folder: Path,
     evaluation: tuple[str, ...],
-    across_trainers: bool,
     out: Path | None,
     everything: bool,
     as_json: bool,
@@ -196,7 +175,7 @@ def report(
     """
     from jbrep import api
 
-    made = api.report(folder, evaluation=evaluation, across_trainers=across_trainers, out=out)
+    made = api.report(folder, evaluation=evaluation, out=out)
     _show(made, everything, as_json)
 
 

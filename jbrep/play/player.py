@@ -22,8 +22,7 @@ from jbrep.rl.settings import MAX_EPISODES
 
 Begin = Callable[[Task, Sequence[int]], Actor]  # as `Policy.begin`
 
-_BATCH_BYTES = 350 * 10**6  # of the steps that `play_first` holds in memory at once
-_MAX_BYTES = 10 * _BATCH_BYTES  # the same, that `play` may return
+_MAX_BYTES = 35 * 10**8  # of the steps that `play` may return
 _BATCH_LANES, _SEPARATE_LANES = 1000, 16  # that `returns` steps at once
 
 
@@ -97,13 +96,6 @@ class Player(NamedTuple):
             motion=motion,
             encoder=self.encoder,
         )
-
-    def play_first(self, count: int, target_yaw: float | None = None) -> Iterator[Rollout]:
-        """Play the first `count` of these episodes, with bounded memory."""
-        check_episodes(count)
-        most = max(1, _BATCH_BYTES // self._episode_bytes)
-        for first in range(0, count, most):
-            yield from self.play(range(first, min(first + most, count)), target_yaw)
 
     def returns(self, count: int, threads: int | None = None, retries: int = 0) -> Array:
         """Returns of the first `count` of these episodes, (count,).

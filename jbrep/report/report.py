@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, inside, make_folder, write_whole
+from jbrep.records.storage import exists, make_folder, write_whole
 from jbrep.report import views
 from jbrep.report.figures import Plot, study_plots, write
 from jbrep.report.figures.panels import PAGE as WHOLE
@@ -72,7 +72,6 @@ def make_report(
     folder: Path,
     out: Path | None = None,
     evaluations: Sequence[str] = (),
-    across_trainers: bool = False,
 ) -> Report:
     """Write the tables of the runs below a folder, if there are any, and the report of the tables.
 
@@ -82,7 +81,6 @@ def make_report(
         folder: with runs, of a study or not, or with the tables of a study alone.
         out: folder for the report; the same one if not given.
         evaluations: as for `jbrep.study.tables.add_diagnostics`.
-        across_trainers: compare runs of different trainers, too.
     """
     out, ran = out or folder, has_runs(folder)
     if not ran:
@@ -95,7 +93,7 @@ def make_report(
         if ran:
             write_tables(folder)
         notes = add_diagnostics(folder, evaluations)
-        tables = read_tables(folder, across_trainers)
+        tables = read_tables(folder)
         found = Findings.of(tables)
         return Report(out, tables, found, notes, write_report(found, out))
 
@@ -108,7 +106,7 @@ def write_report(found: Findings, out: Path) -> list[Path]:
     """
     make_folder(out)
     plots = study_plots(found)
-    write(plots, inside(out, FIGURES))
+    write(plots, out / FIGURES)
     texts = {FINDINGS: found.text(), PAGE: page(found, plots), MARKDOWN: summary(found)}
     for name, text in texts.items():
         write_whole(out / name, text.encode())

@@ -87,7 +87,6 @@ def found(
     record: RunsRecord,
     returns: Sequence[Return],
     references: References,
-    across_trainers: bool = False,
 ) -> tuple[Analysis | None, list[str]]:
     """The statistics of what the tables of a study say, if its runs allow any.
 
@@ -95,7 +94,6 @@ def found(
         record: runs.json.
         returns: returns.csv.
         references: references.csv.
-        across_trainers: compare runs of different trainers, too.
 
     Returns:
         The statistics, None where there are too few runs, or runs that can't be compared; and what
@@ -103,8 +101,6 @@ def found(
     """
     planned = replace(record.planned, prevented=_prevented(record, references))
     runs = _curves(record, returns, references)
-    if across_trainers:
-        runs = [replace(run, trainer="") for run in runs]
     compared, left_out = _comparable(runs, planned.rules.baseline)
     compared, refused = _without_refused(compared, planned.rules.baseline)
     left_out += refused
@@ -265,7 +261,7 @@ def _curve(
     if drawn:  # the overrides say the hyperparameters
         del settings["hyperparameters"]
         settings["overrides"] = {n: v for n, v in shared.overrides.items() if n not in drawn}
-    trainer = [settings.pop(name) for name in ("trainer", "precision", "device")]
+    del settings["device"]
     steps = sorted(by_step)
     returns = [by_step[step] for step in steps]
     episodes = min(map(len, returns), default=0)  # the last evaluation may have more
@@ -282,7 +278,9 @@ def _curve(
         seed=run.seed,
         settings=hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8],
         steps=np.array(steps, dtype=np.int64),
-        returns=np.array([each[:episodes] for each in returns], dtype=np.float64),
+        returns=np.array([each[:episodes] for each in returns], float).reshape(
+            -1, max(episodes, 1)
+        ),
         total_steps=max(run.steps, shared.steps),
         failed_at=run.steps if run.status == FAILED else None,
         return_floor=task.return_floor,
@@ -292,7 +290,6 @@ def _curve(
         top=_mean(able[: shared.final_episodes]),
         top_in_training=_mean(able[:episodes]),
         solved=task.solved_return,
-        trainer=" ".join(trainer),
         environment=_environment(task),
         final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
         encoder_seed=run.encoder_seed,

@@ -1,6 +1,8 @@
-"""What making a study's data and encoders costs, estimated from a short trial of each."""
+"""What a study would cost: its runs, data sets and encoders, each estimated from a short trial."""
 
+import heapq
 import time
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -8,22 +10,30 @@ from typing import NamedTuple
 
 from jbrep.collect.derive import derive
 from jbrep.dataset.manifest import read_manifest
+from jbrep.encoders import FULL
 from jbrep.encoders.file import SUFFIX
 from jbrep.encoders.names import of_seed
+from jbrep.envs.names import is_code
 from jbrep.methods.fit import Fitter
+from jbrep.progress import Progress
 from jbrep.records.storage import exists
+from jbrep.rl import Run
+from jbrep.rl.speed import estimate
+from jbrep.stats.power import Prospect, prospects
 from jbrep.study.config import UNIFORM, data_key
-from jbrep.study.plan import Plan
+from jbrep.study.plan import Cell, Plan
 from jbrep.study.prepare import (
     Made,
     by_name,
+    check,
     collect_made,
     folder_of,
     is_complete,
     made_for,
     source_of,
 )
-from jbrep.study.representations import ByName
+from jbrep.study.representations import ByCode, ByName
+from jbrep.study.runner import usual_workers
 from jbrep.training.method import Learned
 from jbrep.training.trainer import default_batch_size
 
@@ -40,6 +50,64 @@ class Cost(NamedTuple):
     to_go: int
     done: int
     seconds: float  # for those to go, on one core
+
+
+class Forecast(NamedTuple):
+    """What a study would do, and how long it would take."""
+
+    runs: list[tuple[Cell, float]]  # to go, each with its time [s]
+    done: int
+    elapsed: float  # with so many workers [s]
+    workers: int
+    prospects: list[Prospect]  # of its claims
+    made_first: list[Cost]  # data and encoders
+
+
+def forecast(plan: Plan, workers: int | None = None) -> Forecast:
+    """The runs to go, and how long they would take, estimated from a few steps of each learner.
+
+    Args:
+        plan: the study.
+        workers: how many processes would go on at a time; by default as many as are usual.
+    """
+    check(plan)
+    plan.check_folder()
+    workers, cells = workers or usual_workers(plan), plan.unfinished
+    examples = {_kind(cell): cell for cell in cells}
+    seconds = {
+        kind: estimate(_example(plan.run(cell)))
+        for kind, cell in Progress(
+            examples.items(), desc="timing", unit="trial", delay=1, leave=False
+        )
+    }
+    each = [seconds[_kind(cell)] for cell in cells]
+    return Forecast(
+        runs=list(zip(cells, each, strict=True)),
+        done=len(plan.cells) - len(cells),
+        elapsed=until_done(each, workers),
+        workers=workers,
+        prospects=list(prospects(plan.study.planned, plan.study.units)),
+        made_first=costs(plan),
+    )
+
+
+def until_done(durations: Iterable[float], workers: int) -> float:
+    """When the last worker ends, if each takes the longest work that is left."""
+    busy = [0.0] * workers
+    for each in sorted(durations, reverse=True):
+        heapq.heapreplace(busy, busy[0] + each)
+    return max(busy)
+
+
+def _kind(cell: Cell) -> tuple[object, ...]:
+    """What the duration of a run depends on, whatever of its settings seeds draw."""
+    own = cell.representation.name if isinstance(cell.representation, ByCode) else ""
+    return cell.task, cell.learner.name, own
+
+
+def _example(run: Run) -> Run:
+    """A run that takes as long; an encoder that is no code need not exist yet, and costs little."""
+    return run if is_code(run.encoder) else run.replace(encoder=FULL)
 
 
 def costs(plan: Plan) -> list[Cost]:
