@@ -11,7 +11,7 @@ TASKS := move_from_origin face_direction move_in_direction move_to_position move
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures docs figures samples data encoders decoded $(STUDIES) answer programme programme-time worth $(SCORED) trainers policies behaviour clean
+.PHONY: help setup demo test coverage check bench pictures docs figures samples data encoders decoded $(STUDIES) answer programme programme-time worth $(SCORED) policies behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -56,7 +56,7 @@ check: docs ## lint, types, import direction, links of the documentation
 	$(BIN)/lint-imports
 
 bench: $(READY) ## speed as ratios in one run, and what the hand-written policies return
-	for each in quick throughput dataset encoders methods learning cohorts wide inspection heuristics environments; do \
+	for each in quick throughput dataset encoders methods learning inspection heuristics environments; do \
 	  MUJOCO_GL=disable KINETO_LOG_LEVEL=10 $(BIN)/python benchmarks/$$each.py || exit; \
 	done
 
@@ -155,14 +155,6 @@ worth: $(filter worth-%,$(STUDIES)) ## how well they do: seven hours; goes on wh
 $(SCORED): scored-%: $(READY)
 	$(BIN)/python tools/prepare.py studies/$*.toml runs/$*
 	$(BIN)/jbrep evaluate --encoder $$(ls runs/$*/encoders/*/*.safetensors) --data runs/$*/data/* --out results/$*/scores
-
-trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; goes on where it was stopped
-	for study in $(basename $(notdir $(wildcard studies/trainers/*.toml))); do \
-	  test ! -e results/trainers/$$study/returns.csv || continue; \
-	  $(BIN)/jbrep study studies/trainers/$$study.toml --out runs/trainers/$$study || exit; \
-	  mkdir -p results/trainers/$$study; cp runs/trainers/$$study/returns.csv runs/trainers/$$study/runs.json results/trainers/$$study/; \
-	done
-	$(BIN)/python tools/trainers.py results/trainers
 
 policies: $(READY) ## the trained policies that ship, anew: an hour and a half; goes on where it was stopped
 	for study in policies policies-face-direction policies-move-to-pose; do $(BIN)/jbrep study studies/$$study.toml --out runs/$$study || exit; done

@@ -15,8 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 from torch.utils.data import DataLoader, TensorDataset
 
-from jbrep.dae.autoencoder import DAE, NOISE, Reconstruction
-from jbrep.dae.gradient import Gradient
+from jbrep.dae.autoencoder import DAE, NOISE, Gradient, Reconstruction
 from jbrep.encoders import find
 from jbrep.encoders.layers import run
 from jbrep.envs import describe

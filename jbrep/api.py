@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jbrep.report.report import Report
     from jbrep.rl.controller import Controller
     from jbrep.rl.files import RunRecord
-    from jbrep.rl.job import Job
+    from jbrep.rl.run_settings import RunSettings
     from jbrep.study import Study
 
 
@@ -247,7 +247,7 @@ def evaluate(
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
     from jbrep.evaluate.evaluation import EVALUATION
-    from jbrep.records.storage import check_writable
+    from jbrep.records.storage import make_folder
 
     scaled = ScaledDataset.of(data)
     whole = Dataset(truth) if isinstance(truth, str | Path) else truth
@@ -256,7 +256,7 @@ def evaluate(
 
         hidden_of(scaled.dataset, whole)
     if out is not None:
-        check_writable(Path(out), (EVALUATION,))
+        make_folder(Path(out), (EVALUATION,))
     from jbrep.evaluate.diagnosis import diagnose, write  # imports torch
     from jbrep.play.sources import find_good_policy
 
@@ -307,10 +307,10 @@ def train(
     from jbrep.envs.make import is_one_robot
     from jbrep.machine import cores
     from jbrep.rl.bar import Bar
-    from jbrep.rl.job import Job, Session
     from jbrep.rl.run import Run
     from jbrep.rl.settings import MODERN
-    from jbrep.rl.trainers import train_jobs
+    from jbrep.rl.training import Session, standing_of
+    from jbrep.rl.training import train as train_run
 
     known = as_task(task)
     if one_robot := is_one_robot(known, threads):
@@ -318,20 +318,28 @@ def train(
     run = Run.of(known, algorithm, preset, overrides, encoder=encoder, seed=seed, **settings)
     if one_robot and run.learner.hyperparameters.num_envs > 1:
         run = run.replace(learner=run.learner.overridden({"num_envs": 1}))
-    job = Job(run, Path(out), threads or cores(), retries)
-    if ended := job.result:
-        _note(f"the run in {job.folder} had {ended.status} already: nothing was done")
+    folder, found = Path(out), run.find_encoder()
+    now = standing_of(run, folder, found)
+    if now.ended:
+        _note(f"the run in {folder} had {now.ended.status} already: nothing was done")
     else:
-        _note_limits(job)
+        _note_limits(now.settings)
     writers = []
     if wandb:
         from jbrep.rl.tracker import Tracker
 
-        writers.append(Tracker(wandb, job.folder, job.settings))
-    with closing(Bar(run.steps, f"{algorithm} on {job.encoder.name}")) as bar:
-        session = Session(bar.show, stop=stop, writers=writers, keep_checkpoint=True)
-        ((_, record),) = train_jobs([job], session)
-    return Agent(job.folder, record, None if isinstance(encoder, str | Path) else encoder)
+        writers.append(Tracker(wandb, folder, now.settings))
+    with closing(Bar(run.steps, f"{algorithm} on {found.name}")) as bar:
+        session = Session(
+            bar.show,
+            stop=stop,
+            writers=writers,
+            keep_checkpoint=True,
+            threads=threads or cores(),
+            retries=retries,
+        )
+        record = train_run(run, folder, session)
+    return Agent(folder, record, None if isinstance(encoder, str | Path) else encoder)
 
 
 def study(
@@ -339,7 +347,6 @@ def study(
     out: str | Path,
     *,
     workers: int | None = None,
-    width: int | None = None,
     backend: str = "local",
 ) -> "Report":
     """Train a grid of agents, and report what became of them, as `jbrep study` does.
@@ -348,7 +355,6 @@ def study(
         study: a `Study`, what its file would hold as a dictionary, or the file.
         out: a folder; one that was stopped goes on.
         workers: processes at a time; None for one for each core.
-        width: the most agents that learn together in a process; None for what keeps all busy.
         backend: local, or ray for a cluster.
     """
     from jbrep.errors import choose
@@ -360,7 +366,7 @@ def study(
     plan, run = Plan(_study(study), Path(out), file), choose(backend, BACKENDS, "backend")
     for notice in plan.study.notices:
         _note(notice)
-    if crashed := run_study(plan, run, workers, width):
+    if crashed := run_study(plan, run, workers):
         _note(f"{counted(crashed, 'run')} crashed: the same study in that folder tries again")
     return report(plan.folder)
 
@@ -369,7 +375,6 @@ def report(
     folder: str | Path,
     *,
     evaluation: Sequence[str] = (),
-    across_trainers: bool = False,
     out: str | Path | None = None,
 ) -> "Report":
     """Show what a study found, as `jbrep report` does.
@@ -377,18 +382,17 @@ def report(
     Args:
         folder: of a study, of runs, or of the tables of a study.
         evaluation: folders of evaluations of its encoders, whose diagnostics go into the tables.
-        across_trainers: compare runs of different trainers, too.
         out: a folder for the report; None for the study's own.
     """
-    from jbrep.records.storage import check_writable, exists
+    from jbrep.records.storage import exists, make_folder
 
     if not exists(folder):
         raise InputError(f"{folder} is not the folder of a study: there is no such folder")
     if out:
-        check_writable(Path(out))
+        make_folder(Path(out))
     from jbrep.report.report import make_report  # imports torch
 
-    return make_report(Path(folder), Path(out) if out else None, evaluation, across_trainers)
+    return make_report(Path(folder), Path(out) if out else None, evaluation)
 
 
 def _fitter(data: "Dataset | str | Path", out: str | Path, device: str) -> "Fitter":
@@ -421,9 +425,8 @@ def _tell_kept(folder: Path, policy: Mapping[str, Any]) -> None:
             _note(f"{known}, which {folder / part['file']} keeps")
 
 
-def _note_limits(job: "Job") -> None:
+def _note_limits(settings: "RunSettings") -> None:
     """Say of a run what can't come of it."""
-    settings = job.settings
     if settings.steps <= settings.learns_from:
         _note(
             f"{settings.learner} learns from step {settings.learns_from:,} on: "

@@ -1,11 +1,11 @@
 """What this process may use of its machine: cores and memory, within a container's limits."""
 
 import os
+import platform
 from contextlib import suppress
 from pathlib import Path
 
-_MEMORY = Path("/proc/meminfo")
-_OWN = Path("/proc/self/statm")
+_CPU, _MEMORY = Path("/proc/cpuinfo"), Path("/proc/meminfo")
 _CGROUP = Path("/sys/fs/cgroup")
 _LIMITS = {  # what a container may use, and uses, in version 2 of control groups and in version 1
     "memory.max": "memory.current",
@@ -20,6 +20,15 @@ def cores() -> int:
     except ModuleNotFoundError:
         return os.cpu_count() or 1
     return int(cpu_count())
+
+
+def cpu() -> str:
+    """The processor's name, where the system tells it."""
+    with suppress(OSError):
+        for line in _CPU.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def memory() -> int:
@@ -37,13 +46,6 @@ def free_memory() -> int:
             if name == "MemAvailable":  # also what only caches files
                 free.append(int(kilobytes.split()[0]) << 10)
     return max(min(free), 0)
-
-
-def own_memory() -> int:
-    """Bytes of memory that this process takes; 0 where the system doesn't say."""
-    with suppress(OSError):
-        return int(_OWN.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    return 0
 
 
 def _containers() -> list[tuple[int, int]]:

@@ -172,9 +172,13 @@ def facts(named: Mapping[str, str], width: int | None, indent: int = 2) -> str:
 
 
 def interval(values: Sequence[float | None], form: str) -> str:
-    """A value with its interval, if it has one: 1.08 [1.07, 1.09]."""
-    value, low, high = (number(v, form) for v in values)
-    return value if values[1] is None else f"{value} [{low}, {high}]"
+    """A value with its interval, if it has one: 1.08 [1.07, 1.09], or 1.08 [1.07, unbounded]."""
+    value, *ends = values
+    shown = number(value, form)
+    if ends == [None, None]:
+        return shown
+    low, high = ("unbounded" if end is None else number(end, form) for end in ends)
+    return f"{shown} [{low}, {high}]"
 
 
 def number(value: float | None, form: str) -> str:

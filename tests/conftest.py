@@ -26,7 +26,7 @@ needs_egl = pytest.mark.skipif(not HEADLESS, reason="no EGL: install libegl1 and
 @pytest.fixture(scope="session", autouse=True)
 def quick_figures():
     """Fonts as outlines: embedding them takes half of a report's time."""
-    from jbrep.report.figures.style import PAPER
+    from jbrep.report.figures.panels import PAPER
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PAPER, "pdf.fonttype", 3)
@@ -46,7 +46,7 @@ def one_figure(monkeypatch):
     from jbrep.report import report
 
     draw = report.study_plots
-    monkeypatch.setattr(report, "study_plots", lambda *tables: draw(*tables)[:1])
+    monkeypatch.setattr(report, "study_plots", lambda found: draw(found)[:1])
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -15,7 +15,7 @@ from jbrep.collect.derive import derive
 from jbrep.collect.policies import Uniform
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
-from jbrep.collect.shards import Remaining, Simulator
+from jbrep.collect.shards import Growth, Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export
 from jbrep.dataset.manifest import new_manifest, read_manifest
@@ -95,12 +95,13 @@ def test_the_number_of_processes_changes_no_byte(workers, sledges, tmp_path):
     assert contents(tmp_path / "data") == contents(sledges)
 
 
-def test_shards_of_episodes_that_may_end_early_are_started_together():
+def test_shards_of_episodes_that_may_end_early_are_started_together(tmp_path):
     """Though 900 episodes could have more rows than are needed, had they their full length."""
     task = SLEDGE.replace(max_episode_steps=1000)
     made = new_manifest(some(task, steps=200_000, shard_episodes=900))
-    assert Remaining(made).wants(900)
-    assert not Remaining(made.replace(settings=some(task, steps=900, shard_episodes=1))).wants(1)
+    assert Growth(tmp_path, made).wants(900)
+    brief = made.replace(settings=some(task, steps=900, shard_episodes=1))
+    assert not Growth(tmp_path, brief).wants(1)
 
 
 def test_another_division_into_shards_has_the_same_rows(sledges, tmp_path):
@@ -184,27 +185,18 @@ def test_an_environment_that_fails_ends_the_command_in_one_line(tmp_path):
         assert told.exit_code == 2
         assert line == (
             f"Error: Sledges/Broken-v0 failed at step 4 of the episode with seed {seed}: "
-            f"RuntimeError: the rail broke; 7 episodes of {rows} rows are kept"
+            f"RuntimeError: the rail broke; 5 episodes of {rows} rows are kept"
         )
 
 
-def test_a_shard_that_fails_doesn_t_matter_until_it_is_needed():
+def test_a_shard_that_fails_doesn_t_matter_until_it_is_needed(tmp_path):
     """It was begun ahead of time; the one before it takes longer."""
-
-    class Remaining:
-        rows = 10**6
-
-        def wants(self, episode):
-            return episode < 600
-
-        def begun(self, shard):
-            return 0
 
     arguments = {"seed": episode_seed(SLEDGE, 3, 300)}
     task = describe("Sledges/Broken-v0", arguments)
     wide = some(task, steps=10**6, shard_episodes=300)
-    simulator = Simulator(wide, Uniform(), 1, 2)
-    shards = backends.local(simulator)(0, Remaining(), lambda steps: None)
+    growth = Growth(tmp_path, new_manifest(wide))
+    shards = backends.local(Simulator(wide, Uniform(), 1, 2))(growth, lambda steps: None)
     seeds = np.concatenate([next(shards)["episodes/seed"] for _ in range(10)])
     np.testing.assert_array_equal(seeds, wide.seeds(np.arange(300)))
     with pytest.raises(InputError, match="Sledges/Broken-v0 failed at step 4"):

@@ -101,23 +101,6 @@ def test_it_is_resumed_to_the_same_bits(source, later, tmp_path):
     assert_same_files(tmp_path, later, POLICY, BEGINNING, "evaluations.csv")
 
 
-def test_it_is_resumed_once_its_source_has_gone_on(source, tmp_path):
-    """By what it began with, which its folder has; another source is still another run."""
-    first, folder, other = (tmp_path / name for name in ("source", "later", "other"))
-    train(Run.of(**SETTINGS, steps=40, evaluate_every=40), first, Session(keep_checkpoint=True))
-    began = read_run(first).policy_sha256
-    run = Run.of(**SETTINGS, seed=1, steps=40, begin_from=str(first))
-    with pytest.raises(StoppedError):
-        train(run, folder, Session(stop=iter([False] * 3 + [True]).__next__))
-    train(Run.of(**SETTINGS, steps=80, evaluate_every=40), first)
-    assert read_run(first).policy_sha256 != began
-    with pytest.raises(InputError, match=r"checkpoint\.safetensors belongs to another"):
-        train(run.replace(begin_from=str(source)), folder)
-    assert train(run, folder).settings.begin_from == began
-    assert train(run, folder).settings.begin_from == began  # nothing is done
-    assert train(run, other).settings.begin_from == read_run(first).policy_sha256
-
-
 def test_other_arguments_are_another_body(source, tmp_path):
     other = ("--task", cart.ID, "--env", "fail_seed=5", "--algorithm", "sac", "--preset", "modern")
     quick = ("--steps", 8, "--evaluation-episodes", 1, "--from", source, "--out", tmp_path / "run")

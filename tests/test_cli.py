@@ -98,8 +98,6 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
             "unknown backend 'slurm': choose one of local, ray",
         ),
         (("README.md",), "README.md is not valid TOML"),
-        (("studies/paper.toml", "--width", 0), "'--width': 0 is not in the range"),
-        (("studies/paper.toml", "--width", 1000, "--workers", 9), "the width is 1000: 9 cohorts"),
     ):
         refused = jbrep("study", *arguments, "--out", tmp_path / "dry")
         assert (refused.exit_code, refused.output.count("\n")) == (2, 1), refused.output
@@ -158,7 +156,7 @@ def test_every_command_has_help_with_an_example(command):
 MISTAKES = {
     "collect --task fly --steps 1k --out x": "unknown task 'fly'",
     "env environments:Sledge": "Sledge in environments is a class: register it there, as in",
-    "collect --task face_direction --steps -1 --out x": "must be a whole number from 1 to",
+    "collect --task face_direction --steps -1 --out x": "steps is -1",
     "train-dae --data none --latent 8 --out x": "no data set in none",
     "data info none": "no data set in none",
     "data verify none": "no data set in none",
@@ -179,7 +177,7 @@ MISTAKES = {
     "train-encoder --data x --out x --kind slow --latent 8 --lags 5 0": "lags[1] is '0': it must",
     "train-encoder --data x --out x --kind dae --latent 8 --batch-size 0": "batch_size is '0': it",
     "train-encoder --data x --out x --kind dae --latent 8 --weights x": "weights is 'x': it must",
-    "train-encoder --data x --out x --kind dae --latent 12 8,x": "latent is 'x': it must be a",
+    "train-encoder --data x --out x --kind dae --latent 12 8,x": "latent is 'x'",
     "train-encoder --data x --out x --kind slow --lags 5": "slow needs --latent, such as --latent",
     "train-encoder --data x --out x --kind slow --latent 8 --preset authors": "slow has no presets",
     "train-encoder --data x --out x --kind dae --latent 8 --preset x": "unknown preset of dae 'x':",
@@ -190,10 +188,6 @@ MISTAKES = {
     "encoder info none": "no encoder at none",
     "encoder info dae-9 --task face_direction": "no encoder 'dae-9'",
     "rl --task face_direction --encoder x --out y": "no encoder 'x'",
-    "rl --task face_direction --out x --trainer both": "trainer is 'both': it must be",
-    "rl --task face_direction --out x --algorithm ppo --trainer cohort": "not ppo: add --trainer s",
-    "rl --task face_direction --out x --algorithm ppo --precision bfloat16": "sb3 has no bfloat16",
-    "rl --task face_direction --out x --precision half": "precision is 'half': it must be one of",
     "rl --task face_direction --out x --device tpu": "device is 'tpu': it must be one of",
     "report none": "none is not the folder of a study",
     "report": "Missing argument 'FOLDER'. See jbrep report --help.",

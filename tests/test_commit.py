@@ -6,6 +6,7 @@ import pytest
 from small import contents, settings, write_again
 
 from jbrep.collect import collect
+from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import read_manifest, write_manifest
 from jbrep.encoders import find, load, save
 from jbrep.envs import describe
@@ -50,10 +51,10 @@ def test_a_manifest_says_the_commit_of_its_start_and_resumes_at_another(collecte
     write_manifest(folder, manifest.replace(shards=manifest.shards[:4]))
     collect(settings(), folder)
     assert read_manifest(folder) == manifest
-    assert manifest.fingerprint == read_manifest(collected).fingerprint
+    assert Dataset(folder).fingerprint == Dataset(collected).fingerprint
     shards = [name for name in contents(folder) if name.endswith(".h5")]
     assert all(contents(folder)[name] == contents(collected)[name] for name in shards)
-    with pytest.raises(InputError, match="commits must be a git commit"):
+    with pytest.raises(InputError, match="commits"):
         manifest.replace(commits={"jbrep": "main"})
 
 

@@ -1,17 +1,14 @@
 """The container of encoders and checkpoints: whatever changes in one is noticed."""
 
-import json
-
 import numpy as np
 import pytest
-import safetensors.numpy
 import torch
 from small import ONE_EACH, flip_bit
 from tensors import TensorWindows
 
 from jbrep.dae import DAE
 from jbrep.dae.autoencoder import Reconstruction
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import DamageError
 from jbrep.records import container
 from jbrep.rl import Run, Session, train
 from jbrep.rl.files import CHECKPOINT
@@ -89,10 +86,3 @@ def test_a_changed_bit_in_a_checkpoint_of_a_run_is_noticed(stopped):
     flip_bit(path, 8 * len(whole) - 1)
     with pytest.raises(DamageError, match=r"is damaged .*: delete it to start over"):
         train(run, folder)
-
-
-def test_a_checkpoint_without_a_checksum_is_refused(tmp_path):
-    header = {"jbrep": json.dumps({"identity": {}, "history": [[1.0, 1.0]]})}
-    (tmp_path / "at").write_bytes(safetensors.numpy.save({"low": np.zeros(3)}, header))
-    with pytest.raises(InputError, match="has no checksum, so an older jbrep wrote it: delete it"):
-        container.read(tmp_path / "at", "checkpoint")

@@ -16,11 +16,12 @@ from jbrep.errors import InputError
 from jbrep.play.sources import find_player
 from jbrep.records import container
 from jbrep.rl import Run, train
+from jbrep.rl.agent import acting
 from jbrep.rl.controller import Controller, load_policy
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.settings import CLASSES
 from jbrep.rl.shipped import find as find_shipped
-from jbrep.rl.trained import acting, build
+from jbrep.rl.trained import build
 
 TASK = describe("move_to_pose", max_episode_steps=200)
 SETTINGS = {
@@ -189,7 +190,7 @@ def test_what_a_policy_lacks_is_named(tmp_path):
     ("changes", "activation", "message"),
     [
         ({f"policy.mu.{'9' * 5000}.weight": np.zeros((1, 1))}, "relu", "doesn't fit the run's"),
-        ({"policy.mu.weight": np.zeros((1, 3))}, "relu", "takes 3 numbers"),
+        ({"policy.mu.weight": np.zeros((1, 3))}, "relu", "doesn't fit the run's"),
         ({}, "zzz", "activation"),
     ],
 )

@@ -6,7 +6,7 @@ import torch
 from sklearn.decomposition import PCA
 from torch import nn
 
-from jbrep.dae.gradient import Gradient
+from jbrep.dae.autoencoder import Gradient
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.layers import run
 from jbrep.methods.controls import Random

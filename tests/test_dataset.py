@@ -2,21 +2,18 @@
 
 import json
 import pickle
-import resource
 from itertools import accumulate
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from command import jbrep
-from small import flip_bit, settings, write_again
+from small import settings, write_again
 
-from jbrep.collect import collect, write_shards
-from jbrep.dataset import Dataset, ScaledDataset, Scaler, manifest, reader
-from jbrep.dataset.card import card
+from jbrep.collect import collect
+from jbrep.dataset import Dataset, ScaledDataset, Scaler, manifest
 from jbrep.dataset.columns import Column
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 
 
@@ -82,7 +79,7 @@ def test_a_column_as_an_array(column, parts):
     assert column[()].shape == whole[()].shape == (12, 3)
     with pytest.raises(IndexError, match="only the first axis can be indexed by an array"):
         column[[0, 1], [0, 1]]
-    with pytest.raises(IndexError, match="a slice or a mask, not by"):
+    with pytest.raises(IndexError, match="a slice or a mask"):
         column["motor"]
     for key in (12, -13, [3, 12]):
         with pytest.raises(IndexError, match="there are 12"):
@@ -116,22 +113,6 @@ def test_an_array_of_a_column_is_the_reader_s_own(dataset, collected, tmp_path):
         values = np.array(data["reward"])
         assert values.flags.writeable
         assert isinstance(data["reward"][5], np.float32)
-
-
-def test_a_shard_is_read_through_once_however_often_it_is_opened(collected, monkeypatch):
-    hashed = []
-
-    def count(content):
-        hashed.append(len(content))
-        return file_hash(content)
-
-    file_hash = manifest.file_hash
-    monkeypatch.setattr(manifest, "file_hash", count)
-    monkeypatch.setattr(reader, "_OPEN_SHARDS", 2)
-    data = Dataset(collected)
-    for _ in range(3):
-        data["reward"][::500]
-    assert len(hashed) == 5
 
 
 def test_another_process_opens_it_anew(dataset):
@@ -198,103 +179,22 @@ def test_a_feature_that_never_changes_is_scaled_to_0():
     np.testing.assert_array_equal(scaler.unscale(np.array([[0, 1]], np.float32)), [[2, 1]])
 
 
-@pytest.mark.parametrize("memory", [1 << 30, 100_000], ids=["memory", "runs"])
-def test_every_row_comes_once_in_a_pass_in_another_order_each_time(dataset, memory):
-    rows = dataset.split().train
-    names = ("observation", "episode", "step")
-    batches = dataset.batches(rows, names, size=300, seed=5, memory=memory)
-    assert batches.in_memory == (memory > 1_000_000)
-    passes = []
-    for _ in range(2):
-        drawn = list(batches)
-        assert [len(batch["step"]) for batch in drawn] == [300] * 13 + [100]
-        assert len(drawn) == len(batches)
-        number = np.concatenate([batch["episode"] * 1000 + batch["step"] for batch in drawn])
-        observation = np.concatenate([batch["observation"] for batch in drawn])
-        np.testing.assert_array_equal(observation, dataset["observation"][number])
-        np.testing.assert_array_equal(np.sort(number), rows)
-        passes.append(number)
-    assert (passes[0] != passes[1]).mean() > 0.9
-    again = next(iter(dataset.batches(rows, names, size=300, seed=5, memory=memory)))
-    np.testing.assert_array_equal(again["episode"] * 1000 + again["step"], passes[0][:300])
-    other = next(iter(dataset.batches(rows, names, size=300, seed=6, memory=memory)))
-    assert not np.array_equal(other["step"], again["step"])
+def test_a_reader_sees_whole_shards_while_a_collector_writes(collected, tmp_path):
+    seen, whole = [], Dataset(collected)
 
+    def look(columns):
+        dataset = Dataset(tmp_path / "growing")
+        np.testing.assert_array_equal(dataset["observation"], whole["observation"][: len(dataset)])
+        seen.append((len(dataset), dataset.manifest.complete))
+        return columns
 
-def test_a_batch_from_the_disk_mixes_runs_and_one_that_can_t_be_is_refused(dataset):
-    batches = dataset.batches(columns=["step", "episode"], size=512, memory=8 * 2048)
-    assert not batches.in_memory
-    assert np.mean([len(np.unique(batch["episode"])) for batch in batches]) > 1.5
-    for wrong in ({"size": 0}, {"seed": -1}):
-        with pytest.raises(InputError, match="must be at least 1 and 0"):
-            dataset.batches(**wrong)
-
-
-def test_a_reader_sees_the_committed_part_while_a_collector_writes(
-    collected, tmp_path, monkeypatch
-):
-    seen = []
-
-    def look(content, path):
-        folder = path.parent
-        shards = sorted(path.name for path in folder.glob("shard-*.h5"))
-        if shards and path.name == manifest.MANIFEST:
-            dataset = Dataset(folder)
-            np.testing.assert_array_equal(
-                dataset["observation"][:], Dataset(collected)["observation"][: len(dataset)]
-            )
-            seen.append((len(shards), len(dataset), dataset.manifest.complete))
-        return write(content, path)
-
-    write = manifest.Manifest.write
-    monkeypatch.setattr(manifest.Manifest, "write", look)
-    write_again(collected, tmp_path / "growing")
-    assert seen == [(k, 1000 * k, k == 5) for k in range(1, 6)]
-
-
-def test_a_reader_keeps_what_it_opened_when_its_last_shard_grows(tmp_path):
-    folder = tmp_path / "growing"
-    collect(settings(steps=2000, shard_episodes=4), folder, num_threads=1)
-    used, unused = Dataset(folder), Dataset(folder)
-    seen, late = used["observation"][:], used["action"]
-    collect(settings(steps=3000, shard_episodes=4), folder, num_threads=1)
-    for each in (used, unused):
-        np.testing.assert_array_equal(each["observation"][:], seen)
-        assert len(each["reward"][:]) == len(each) == 2000
-        assert each.episodes["length"].tolist() == [1000, 1000]
-    np.testing.assert_array_equal(late[:], Dataset(folder)["action"][:2000])
-    used._opened.cache_clear()
-    np.testing.assert_array_equal(used["observation"][:], seen)
-    flip_bit(folder / "shard-00000.h5", 8 * 100_000)
-    with pytest.raises(DamageError, match=r"shard-00000\.h5 is damaged"):
-        Dataset(folder)["reward"][:]
-    with pytest.raises(DamageError, match=r"shard-00000\.h5 is damaged"):
-        used["reward"][:]
-
-
-def test_shards_committed_while_it_opens_are_no_strangers(collected, tmp_path, monkeypatch):
-    folder = tmp_path / "growing"
-
-    def stop(first, missing, tick):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_shards(settings(), folder, stop)
-
-    def read_late(folder):
-        found = current_manifest(folder)
-        write_again(collected, folder)
-        return found
-
-    current_manifest = manifest.current_manifest
-    monkeypatch.setattr(reader, "current_manifest", read_late)
-    assert len(Dataset(folder)) == 0
-    monkeypatch.undo()
-    assert len(Dataset(folder)) == 5000
+    write_again(collected, tmp_path / "growing", look)
+    assert seen == [(1000 * k, False) for k in range(5)]
+    assert Dataset(tmp_path / "growing").manifest.complete
 
 
 def test_the_card_tells_what_is_there(dataset, collected):
-    text = card(dataset)
+    text = dataset.card()
     for part in ("face_direction, 16 features", "uniform", "5 of 1,000 steps", "5 shards, 1.7 MB"):
         assert part in text
     low, median, high = np.percentile(dataset.episodes["return"], (10, 50, 90))
@@ -304,13 +204,13 @@ def test_the_card_tells_what_is_there(dataset, collected):
     assert [float(word) for word in line[2:6]] == pytest.approx(
         [speed.min(), speed.mean(), speed.max(), speed.std()], rel=1e-3
     )
-    assert dataset.manifest.fingerprint in text
+    assert dataset.fingerprint in text
 
 
 @pytest.mark.parametrize("width", [60, 80, 200])
 def test_the_card_fits_the_terminal(width, dataset):
-    text = card(dataset, width).replace(str(dataset.folder), "face").splitlines()
-    facts = [line for line in text if dataset.manifest.fingerprint not in line]
+    text = dataset.card(width).replace(str(dataset.folder), "face").splitlines()
+    facts = [line for line in text if dataset.fingerprint not in line]
     assert max(map(len, facts)) <= width
     assert len([line for line in text if line.startswith("feature ")]) == (1 if width == 200 else 2)
 
@@ -336,7 +236,7 @@ def test_an_unfinished_data_set_is_called_so(collected, tmp_path):
     manifest.write_manifest(tmp_path, whole.replace(shards=()))
     empty = Dataset(tmp_path)
     assert len(empty) == len(empty["observation"][:]) == 0
-    assert "0 shards, 0.0 MB; unfinished, 5,000 rows were asked for" in card(empty)
+    assert "0 shards, 0.0 MB; unfinished, 5,000 rows were asked for" in empty.card()
     with pytest.raises(InputError, match="a split needs at least 2 episodes"):
         empty.split()
 
@@ -377,27 +277,25 @@ def test_mistakes_are_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "field"),
     [
-        ({"task": 3}, "environment is 3: it must be a table"),
-        ({"seed": -1}, "seed is -1: it must be a whole number from 0 to 2,147,483,646"),
-        ({"seed": "one"}, "seed is 'one': it must be a whole number"),
-        ({"steps": 1.5}, "steps is 1.5: it must be a whole number"),
-        ({"shard_episodes": None}, "shard_episodes is None: it must be a whole number"),
-        ({"store_state": "yes"}, "store_state is 'yes': it must be true or false"),
-        ({"policy": "uniform"}, "policy is 'uniform': it must be a kind and its constants"),
-        ({"policy": {"kind": "constant", "drive": None}}, "must be a number or text of at most"),
-        ({"policy": {"kind": "imported", "source": "a" * 201}}, "text of at most 200 letters"),
-        ({"policy": {"kind": "imported", "source": "\x1b[2J"}}, "text that can't be printed"),
-        ({"policy": {"kind": "imported", "source": ["\x1b"]}}, "text that can't be printed"),
-        ({"policy": {"kind": "imported", "source": [1] * 1001}}, "must be a number or text"),
-        ({"policy": {"kind": "mixture", "parts": [[1, "uniform"]] * 2}}, "it must be a table"),
-        ({"policy": {"kind": "mixture", "parts": [[0, {"kind": "a"}]] * 2}}, "number above 0"),
-        ({"policy": {"kind": "imported", 1: 1}}, "it must be a kind and its constants"),
+        ({"task": 3}, "environment"),
+        ({"seed": -1}, "seed"),
+        ({"steps": 1.5}, "steps"),
+        ({"shard_episodes": None}, "shard_episodes"),
+        ({"store_state": "yes"}, "store_state"),
+        ({"policy": "uniform"}, "policy"),
+        ({"policy": {}}, "kind"),
+        ({"policy": {"kind": "constant", "drive": None}}, "policy"),
+        ({"policy": {"kind": "imported", "source": "a" * 201}}, "policy"),
+        ({"policy": {"kind": "imported", "source": "\x1b[2J"}}, "policy"),
+        ({"policy": {"kind": "mixture", "parts": [[1, "uniform"]] * 2}}, "mixture"),
+        ({"policy": {"kind": "mixture", "parts": [[0, {"kind": "a"}]] * 2}}, "mixture"),
+        ({"policy": {"kind": "trained", "file": "../policy-0.safetensors"}}, "file"),
     ],
 )
-def test_invalid_settings_are_refused_in_words(change, message):
-    with pytest.raises(InputError, match=message):
+def test_a_setting_that_can_t_be_is_named(change, field):
+    with pytest.raises(InputError, match=field):
         settings(**change)
 
 
@@ -411,11 +309,3 @@ def test_the_constants_of_a_policy_are_numbers_and_text_in_lists_and_tables():
 def test_the_samples_are_verified(task):
     told = jbrep("data", "verify", f"data/sample/{task}", "--replay", 1)
     assert (told.exit_code, "no problems in 4,000 rows, 1 shard" in told.output) == (0, True)
-
-
-def test_shards_take_half_of_the_files_that_a_process_may_open(brief, monkeypatch):
-    monkeypatch.setattr(resource, "getrlimit", lambda what: (4, 4))
-    before, dataset = len([*Path("/dev/fd").iterdir()]), Dataset(brief)
-    assert len([*brief.glob("shard-*.h5")]) > 2
-    assert len(dataset["observation"][:]) == dataset.episodes["length"].sum()
-    assert len([*Path("/dev/fd").iterdir()]) == before + 2

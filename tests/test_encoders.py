@@ -6,7 +6,6 @@ import os
 import pickle
 import re
 import struct
-import time
 from pathlib import Path
 
 import numpy as np
@@ -108,16 +107,6 @@ def test_gradients_flow_after_a_first_use_without_them(on):
     assert rows.grad.any()
 
 
-def test_gradients_flow_through_torch(encoder):
-    rows = torch.from_numpy(observations(2)).requires_grad_()
-    encoder.encode(rows).sum().backward()
-    step = 1e-2
-    moved = rows.detach().clone()
-    moved[:, 3] += step
-    change = (encoder.encode(moved) - encoder.encode(rows.detach())).sum(1) / step
-    np.testing.assert_allclose(rows.grad[:, 3], change, rtol=0.05, atol=1e-3)
-
-
 def test_another_length_is_refused(encoder):
     with pytest.raises(
         InputError, match=r"takes observations of 16 numbers, but got shape \(2, 15\)"
@@ -159,62 +148,30 @@ def test_any_changed_bit_is_refused(encoder, tmp_path):
             load(path)
 
 
-def test_truncated_appended_and_foreign_files_are_refused(encoder, tmp_path):
-    path = tmp_path / "encoder"
-    with pytest.raises(InputError, match="no encoder at"):
-        load(path)
-    save(encoder, path)
-    whole = path.read_bytes()
-    stream = io.BytesIO()
-    torch.save({"low": torch.zeros(16)}, stream)
-    other = safetensors.numpy.save({"low": np.zeros(16, np.float32)})
-    for content in (
-        b"",
-        whole[:7],
-        whole[:100],
-        whole[:-4],
-        whole + b"x",
-        stream.getvalue(),
-        other,
-    ):
-        path.write_bytes(content)
-        with pytest.raises(InputError, match="is not a jbrep encoder"):
-            load(path)
-
-
 class Bomb:
     def __reduce__(self):
         return os.mkdir, ("exploded",)
 
 
-def test_nothing_in_a_file_is_run(tmp_path, monkeypatch):
+def test_what_is_no_encoder_is_refused_and_nothing_in_it_is_run(encoder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name, content in {
-        "pickle": pickle.dumps(Bomb()),
-        "in a header": struct.pack("<Q", 100) + pickle.dumps(Bomb()).ljust(100),
-    }.items():
-        (tmp_path / name).write_bytes(content)
+    path, stream = tmp_path / "encoder", io.BytesIO()
+    with pytest.raises(InputError, match="no encoder at"):
+        load(path)
+    save(encoder, path)
+    whole, bomb = path.read_bytes(), pickle.dumps(Bomb())
+    torch.save({"low": torch.zeros(16)}, stream)
+    other = safetensors.numpy.save({"low": np.zeros(16, np.float32)})
+    in_header = struct.pack("<Q", 100) + bomb.ljust(100)
+    for content in (b"", whole[:100], whole[:-4], whole + b"x", stream.getvalue(), other):
+        path.write_bytes(content)
         with pytest.raises(InputError, match="is not a jbrep encoder"):
-            load(tmp_path / name)
-    assert not (tmp_path / "exploded").exists()
-
-
-def test_hostile_sizes_end_at_once(tmp_path):
-    start = time.process_time()
-    huge, pipe = tmp_path / "huge", tmp_path / "pipe"
-    with huge.open("wb") as file:
-        file.truncate(1 << 40)
-    os.mkfifo(pipe)
-    for path in (huge, pipe, tmp_path):
-        with pytest.raises(InputError, match="1 to 16,777,216 bytes"):
             load(path)
-    deep = b"[" * 100_000
-    for length in (2**63, len(deep), 0):
-        huge.unlink()
-        huge.write_bytes(struct.pack("<Q", length) + deep)
+    for content in (bomb, in_header):
+        path.write_bytes(content)
         with pytest.raises(InputError, match="is not a jbrep encoder"):
-            load(huge)
-    assert time.process_time() - start < 5
+            load(path)
+    assert not (tmp_path / "exploded").exists()
 
 
 def forged(encoder, path, **changes):
@@ -228,58 +185,22 @@ def forged(encoder, path, **changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"decoder.0.bias": np.zeros(3, np.float32)}, r"tensor decoder.0.bias has shape \(3,\)"),
-        (
-            {"encoder.1.weight": np.zeros((3, 4), np.float32)},
-            r"encoder.1.weight has shape \(3, 4\)",
-        ),
-        ({"encoder.0.weight": np.zeros(16, np.float32)}, r"encoder.0.weight has shape \(16,\)"),
-        (
-            {"encoder.0.bias": np.zeros(5)},
-            "tensor encoder.0.bias has type float64, expected float32",
-        ),
-        (
-            {"high": np.full(16, np.nan, np.float32)},
-            "tensor high holds a number that is not finite or not below",
-        ),
-        ({"low": np.zeros(15, np.float32)}, r"tensor low has shape \(15,\), expected \(16,\)"),
-        (
-            {"low": np.zeros((16, 1), np.float32)},
-            r"tensor low has shape \(16, 1\), expected \(16,\)",
-        ),
-        (
-            {"decoder.0.weight": np.full((16, 3), 3e38, np.float32)},
-            "not finite or not below 1e\\+12",
-        ),
-        (
-            {
-                "encoder.1.weight": np.zeros((0, 5), np.float32),
-                "encoder.1.bias": np.zeros(0, np.float32),
-            },
-            r"encoder.1.weight has shape \(0, 5\), expected \(1, 5\)",
-        ),
-        ({"header": {"metrics": {}}}, "the header's metrics have no held_out_mse"),
-        ({"header": {"data": []}}, r"data is \[\]: it must be a table"),
+        ({"decoder.0.bias": np.zeros(3, np.float32)}, "tensor decoder.0.bias has shape"),
+        ({"encoder.1.weight": np.zeros((0, 5), np.float32)}, "encoder.1.weight has shape"),
+        ({"encoder.0.bias": np.zeros(5)}, "tensor encoder.0.bias has type float64"),
+        ({"high": np.full(16, np.nan, np.float32)}, "tensor high holds a number"),
+        ({"low": np.zeros(15, np.float32)}, "tensor low has shape"),
         ({"encoder.1.bias": None}, "tensor encoder.1.bias is missing"),
         ({"spy": np.zeros(1, np.float32)}, "unexpected tensor spy"),
+        ({"header": {"metrics": {}}}, "metrics have no held_out_mse"),
         ({"header": {"encoder": ["relu", "sine"]}}, "unknown activation 'sine'"),
+        ({"header": {"encoder": ["relu", "onnx"]}}, "tensor encoder.1.onnx is missing"),
         ({"header": {"decoder": []}}, "unexpected tensor decoder"),
-        ({"header": {"decoder": ["tanh", 1]}}, r"decoder\[1\] is 1: it must be text"),
-        ({"header": {"name": "\x1b[2J"}}, "must be lower-case letters, digits and hyphens"),
-        ({"header": {"metrics": 3}}, "metrics is 3: it must be a table"),
-        ({"header": {"metrics": {"spectrum": 5}}}, "metrics.spectrum is 5: it must be a list"),
-        (
-            {"header": {"metrics": {"spectra": [1]}}},
-            r"metrics.spectra is \[1\]: it must be a table",
-        ),
-        ({"header": {"metrics": {"loss_by_term": {"x": "y"}}}}, "metrics.loss_by_term"),
-        ({"header": {"metrics": {"held_out_mse": float("inf")}}}, "all numbers finite"),
-        ({"header": {"environment": 7}}, "environment is 7: it must be a table"),
-        ({"header": {"environment": {}}}, "environment.id is missing"),
-        ({"header": {"task": "Ant-v5"}}, "unknown task: it must be one of kind, name, environment"),
-        ({"header": {"format_version": 4}}, "has version 4 .*: this jbrep reads version 5 alone"),
-        ({"header": {"format_version": 6}}, "has version 6"),
-        ({"header": {"format_version": -1}}, "its format version is -1"),
+        ({"header": {"name": "\x1b[2J"}}, "name"),
+        ({"header": {"metrics": {"held_out_mse": float("inf")}}}, "finite"),
+        ({"header": {"environment": {}}}, "environment.id"),
+        ({"header": {"task": "Ant-v5"}}, "task"),
+        ({"header": {"format_version": 4}}, "version 4"),
         ({"header": {"format": "other"}}, "not a jbrep encoder file"),
     ],
 )
@@ -291,10 +212,9 @@ def test_a_forgery_is_refused_and_the_tensor_named(encoder, changes, message, tm
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"name": "My encoder"}, "name is 'My encoder': it must be lower-case letters"),
-        ({"metrics": {"held_out_mse": float("nan")}}, "all numbers finite"),
-        ({"data": {"rows": object()}}, "it must be plain JSON"),
-        ({"keep": ("velocity_x",) * 2}, "what it keeps must be different features"),
+        ({"name": "My encoder"}, "name is 'My encoder'"),
+        ({"data": {"rows": object()}}, "plain JSON"),
+        ({"keep": ("velocity_x",) * 2}, "different features"),
     ],
 )
 def test_a_header_that_no_file_can_have_is_refused(changes, message):
@@ -302,23 +222,12 @@ def test_a_header_that_no_file_can_have_is_refused(changes, message):
         header(**changes)
 
 
-def test_saving_refuses_what_loading_would(tmp_path):
-    with pytest.raises(InputError, match=r"can't save .*: .*metrics have no held_out_mse"):
-        save(make(metrics={}), tmp_path / "it")
-    assert not list(tmp_path.iterdir())
-
-
 def test_saving_refuses_a_file_too_large_to_load(tmp_path):
     wide = (layer(16, 2048, "relu"), layer(2048, 2048, "relu"), layer(2048, 3, "tanh"))
-    with pytest.raises(InputError, match="bytes are more than 16,777,216"):
+    with pytest.raises(InputError, match="bytes are more than"):
         save(make(wide), tmp_path / "it")
-
-
-def test_wide_layers_are_refused():
-    with pytest.raises(InputError, match="a layer has 5000 units: the limit is 4096"):
+    with pytest.raises(InputError, match="a layer has 5000 units"):
         make((layer(16, 5000, "relu"), layer(5000, 3, "tanh")))
-    larger = make((layer(16, 17, "tanh"),), (layer(17, 16, "linear"),))
-    assert larger.encode(np.zeros(16)).shape == (17,)
 
 
 def test_an_encoder_of_another_environment_or_other_features_is_refused(encoder):
@@ -376,30 +285,20 @@ def test_onnx_gives_what_torch_gives(encoder, rows, tmp_path):
 
 def test_the_card_tells_layers_and_ranges_and_fits_the_terminal(encoder):
     text = card(encoder, "encoders/dae-3.safetensors", 80)
-    assert "16 -> 5 relu -> 3 tanh" in text
-    assert "encoders/dae-3.safetensors" in text
-    assert encoder.fingerprint in text
-    assert re.search(r"environment +Jitterbug/FaceDirection-v0\n", text)
+    for told in ("16 -> 5 relu -> 3 tanh", "encoders/dae-3.safetensors", encoder.fingerprint):
+        assert told in text
     assert re.search(r"motor_velocity \[rad/s\] +-15 +17", text)
     of_pendulum = card(make(task=PENDULUM), "here", 80)
     assert re.search(r"environment +Pendulum-v1, g=1.6\n", of_pendulum)
-    assert re.search(r"\nobs_2 +-3 +5", of_pendulum)
     for name in ("dae-8", "full"):
         lines = card(find(name, TASK), f"{name}, shipped", 80).splitlines()
         assert max(map(len, lines)) <= 80
-
-
-def test_the_card_as_json_has_the_same(encoder):
     told = json.loads(json.dumps(described(encoder, "here")))
-    assert told["encoder"] == [
-        {"units": 5, "activation": "relu"},
-        {"units": 3, "activation": "tanh"},
-    ]
+    assert told["encoder"][0] == {"units": 5, "activation": "relu"}
     feature = {"name": "motor_angle", "unit": "rad", "low": -14, "high": 16}
     assert told["features"][13] == feature
     assert (told["source"], told["sha256"]) == ("here", encoder.fingerprint)
     assert (told["environment"], told["arguments"]) == ("Jitterbug/FaceDirection-v0", {})
-    assert described(make(task=PENDULUM), "here")["arguments"] == {"g": 1.6}
 
 
 @pytest.mark.parametrize("name", TASKS)

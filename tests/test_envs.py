@@ -7,6 +7,7 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
+from command import refused
 from conftest import HEADLESS, needs_egl
 from gymnasium.envs.mujoco.utils import check_mujoco_reset_state
 from gymnasium.utils.env_checker import check_env
@@ -182,32 +183,18 @@ def test_missing_opengl_is_said_in_one_line_and_all_else_works(monkeypatch):
     assert environment.step(np.zeros(1))[0].shape == (16,)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"form": "image"}, "unknown form 'image': choose one of flat, dict"),
-        ({"num_envs": 0}, "the number of lanes is 0"),
-        ({"max_episode_steps": -1}, "steps in an episode is -1: it must be at least 1"),
-        ({"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}, "SAME_STEP or DISABLED"),
-        ({"dtype": "float16"}, "unknown dtype 'float16': choose one of float32, float64"),
-    ],
-)
-def test_what_can_t_be_made(options, message):
-    with pytest.raises(InputError, match=message):
-        gymnasium.make_vec(FACE, **options)
-
-
 def test_mistakes_are_named():
+    next_step = gymnasium.vector.AutoresetMode.NEXT_STEP
+    for name, value in (("form", "image"), ("dtype", "float16"), ("autoreset_mode", next_step)):
+        assert str(value) in refused(lambda: gymnasium.make_vec(FACE, **{name: value}))  # noqa: B023
+    assert "lanes" in refused(lambda: gymnasium.make_vec(FACE, num_envs=0))
     many = gymnasium.make_vec(FACE, num_envs=2)
-    with pytest.raises(InputError, match="3 seeds for 2 lanes"):
-        many.reset(seed=[1, 2, 3])
+    assert "3 seeds for 2 lanes" in refused(lambda: many.reset(seed=[1, 2, 3]))
     many.reset()
-    with pytest.raises(InputError, match=r"shape \(2,\): it must be \(2, 1\)"):
-        many.step(np.zeros(2))
+    assert "(2, 1)" in refused(many.step, np.zeros(2))
     single = gymnasium.make(FACE).unwrapped
     single.reset()
-    with pytest.raises(InputError, match="not finite"):
-        single.step(np.array([np.nan]))
+    assert "not finite" in refused(single.step, np.array([np.nan]))
 
 
 def without_a_display(code):
@@ -238,23 +225,14 @@ def test_a_window_without_a_display_is_refused_in_one_line():
     )
 
 
-_RENDERS = {
-    "gymnasium": f"env = gymnasium.make('{FACE}', render_mode='rgb_array')\n"
-    "env.reset(); env.render()",
-    "dm_control": "from jbrep import jitterbug\n"
-    "jitterbug.load('face_direction').physics.render(48, 64)",
-    "camera": "from jbrep.opengl import find_opengl; find_opengl()\n"
-    "from jbrep.play.pictures import Camera; Camera()",
-}
-
-
 @needs_egl
-@pytest.mark.parametrize("renders", _RENDERS)
-def test_triton_can_be_imported_after_rendering(renders):
+def test_triton_can_be_imported_after_rendering():
     """Torch does so with its first optimiser; where Mesa renders, the process crashed."""
-    for package in ("triton", *(["dm_control"] if renders == "dm_control" else [])):
-        pytest.importorskip(package)
-    done = without_a_display(f"{_RENDERS[renders]}\nimport triton")
+    pytest.importorskip("triton")
+    done = without_a_display(
+        f"env = gymnasium.make('{FACE}', render_mode='rgb_array')\n"
+        "env.reset(); env.render()\nimport triton"
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -47,7 +47,7 @@ def test_everything_that_one_can_bring(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("MINARI_DATASETS_PATH", "")
     runpy.run_path(str(OWN), run_name="__main__")
     told = capfd.readouterr().out
-    assert "the module and the file from ONNX give equal tables" in told
+    assert "the module and the file from ONNX give equal codes" in told
     assert "the data set that has grown equals the one collected at once" in told
     for made in ("study/report.html", "mine.rrd", "pendulum-encoders/pca-2.safetensors"):
         assert (tmp_path / "out" / made).stat().st_size > 1000, made

@@ -8,6 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from jbrep.report.figures.curves import every_run
+from jbrep.report.figures.diagnostics import _free
+from jbrep.report.figures.differences import difference_plot
+from jbrep.report.figures.methods import method_plots, timescales
+from jbrep.report.figures.plot import Drawing
+from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, family, styles, with_runs
 from judged import NOTHING, diagnostics, evaluation, prediction
 from made_up import drawn, label_of, returns_of
 from matplotlib.text import Text
@@ -24,12 +30,6 @@ from jbrep.evaluate.evaluation import (
 )
 from jbrep.records.document import read_document
 from jbrep.report.figures import encoder_plots, study_plots, write
-from jbrep.report.figures.curves import every_run
-from jbrep.report.figures.diagnostics import _free
-from jbrep.report.figures.differences import difference_plot
-from jbrep.report.figures.methods import method_plots, timescales
-from jbrep.report.figures.plot import Drawing
-from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, family, styles, with_runs
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval

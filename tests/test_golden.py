@@ -101,9 +101,10 @@ def test_a_study_and_its_report(folder):
         for each in ("standing still", "constant drive", "random", "hand-written")
     }
     assert [*references.values()] == pytest.approx([10.5755, 36.7006, 5.7395, 52.45], rel=1e-3)
-    numbers = json.loads((study / "summary.json").read_text())["numbers"]
+    (group,) = json.loads((study / "findings.json").read_text())["groups"]
+    numbers = {each["representation"]: each["numbers"] for each in group["agents"]}
     for name in ("full", "pca-8"):
-        of = numbers[f"face_direction/sac/{name}"]
+        of = numbers[name]
         last = mean(returns(study / "returns.csv", representation=name, step=200))
         assert of["final_return_mean"][0] == pytest.approx(last, rel=1e-6)
         assert of["score"][0] == pytest.approx((last - 36.7006) / (52.45 - 36.7006), rel=1e-3)

@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pytest
 from command import in_this_process, jbrep, refused
+from jbrep.report.returns import returns_tables
+from jbrep.report.shares import share_cells, shares_of_runs
 from small import flip_bit
 
 from jbrep.envs import describe
@@ -12,8 +14,6 @@ from jbrep.envs.infos import by_name, number_of, numbers_in, shares, shares_text
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.names import import_modules
 from jbrep.report import report
-from jbrep.report.returns import returns_tables
-from jbrep.report.shares import share_cells, shares_of_runs
 from jbrep.report.tables import read_tables
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, INFOS, Info, read_infos, read_run

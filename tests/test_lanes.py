@@ -122,52 +122,13 @@ def test_a_lane_that_has_ended_stands_still():
         np.testing.assert_array_equal(each.step.observation[before], last[before])
         assert not each.step.reward[before].any()
         np.testing.assert_array_equal(each.step.terminated[before], True)
-        assert lanes.num_active == (~lanes.ended).sum()
-        for lane in np.flatnonzero(lanes.ended):
+        assert lanes.num_active == lanes.active.sum()
+        for lane in np.flatnonzero(~lanes.active):
             ended_at.setdefault(lane, step)
         last = each.step.observation.copy()
     assert len(set(ended_at.values())) > 1
     np.testing.assert_array_equal(lanes.reset([0], [0])[1:], last[1:])
-    assert lanes.ended.tolist() == [False, True, True, True]
-
-
-@each_task
-@pytest.mark.parametrize("fresh", [False, True], ids=["used", "fresh"])
-def test_a_state_is_continued_to_the_same_bits(fresh, task):
-    """With lanes at different steps of their episodes, one of them ended; on more threads, too."""
-    lanes = Lanes(task, 4, 1)
-    lanes.reset(range(4), [1, 2, 3, 4])
-    actions = actions_of(task, [1, 2, 3, 4], 60)
-    for step, action in enumerate(actions[:35]):
-        if step in (20, 31):  # the time limit of all lanes is at 30
-            lanes.reset([step // 10 - 2], [step])
-        lanes.step(action)
-    assert lanes.ended.any()
-    assert not lanes.ended.all()
-    state = lanes.state
-    kept = {name: values.copy() for name, values in state.items()}
-    ends = lanes.terminated.copy(), lanes.truncated.copy()
-    expected = [lanes.step(action) for action in actions[35:45]]
-    other = Lanes(task, 4, 2) if fresh else lanes
-    other.restore(state)
-    np.testing.assert_array_equal(other.terminated, ends[0])
-    np.testing.assert_array_equal(other.truncated, ends[1])
-    np.testing.assert_array_equal(other.observation, kept["observation"])
-    for action, before in zip(actions[35:45], expected, strict=True):
-        for one, again in zip(before[:4], other.step(action)[:4], strict=True):
-            np.testing.assert_array_equal(one, again)
-    for name, values in kept.items():
-        np.testing.assert_array_equal(state[name], values)
-
-
-@pytest.mark.parametrize("name", ["Moody", "Worn"])
-def test_a_state_of_what_is_not_reproducible_is_not_passed_off_as_the_same(name):
-    task = describe(f"Sledges/{name}-v0")
-    lanes = Lanes(task, 2)
-    lanes.reset([0, 1], [1, 2])
-    lanes.step(actions_of(task, [1, 2], 1)[0])
-    with pytest.raises(InputError, match=f"Sledges/{name}-v0 is not reproducible here"):
-        lanes.restore(lanes.state)
+    assert lanes.active.tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize("how", ["raises", "size", "nan", "huge", "reward"])

@@ -4,6 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from jbrep.report.figures.style import limits
+from jbrep.report.statistics import statistics_text
 from made_up import drawn, label_of, returns_of
 
 from jbrep.envs.task import Feature, Task
@@ -11,8 +13,6 @@ from jbrep.errors import InputError
 from jbrep.records.tables import write_csv
 from jbrep.report import write_report
 from jbrep.report.figures import study_plots, write
-from jbrep.report.figures.style import limits
-from jbrep.report.statistics import statistics_text
 from jbrep.report.tables import read_tables
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Interval

@@ -3,18 +3,16 @@
 import numpy as np
 import pytest
 
-from jbrep.rl.noise import ColouredNoise, beginning
+from jbrep.rl.noise import ColouredNoise
 
 STEPS = 1000
 
 
 def episodes(noise, lanes):
-    """What lanes draw in their first episode, (lanes, steps)."""
-    generator, memory, drawn = np.random.RandomState(0), beginning(lanes, 1), []
-    for _ in range(STEPS):
-        memory = noise.after(memory, STEPS, generator)
-        drawn.append([each[0, 0] for each in memory])
-    return np.array(drawn).T
+    """What environments draw in their first episode, (lanes, steps)."""
+    np.random.seed(0)  # noqa: NPY002 - stable-baselines3 draws there
+    each = [noise.make(1, STEPS) for _ in range(lanes)]
+    return np.array([[float(one()[0]) for _ in range(STEPS)] for one in each])
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.5, 1.0, 2.0])
@@ -27,22 +25,17 @@ def test_coloured_noise_has_its_spectrum_and_spread(beta):
     assert np.sqrt((drawn**2).mean()) == pytest.approx(0.3, rel=0.2)
 
 
-def test_a_lane_draws_its_next_episode_when_the_last_is_over_or_cut_short():
+def test_noise_of_the_next_episode_is_drawn_when_the_last_is_over_or_cut_short():
+    np.random.seed(0)  # noqa: NPY002
+    whole = [ColouredNoise().make(2, 4) for _ in range(3)]
+    firsts = [each() for each in whole]
+    np.random.seed(0)  # noqa: NPY002
     noise = ColouredNoise().make(2, 4)
-    np.random.seed(0)  # noqa: NPY002 - stable-baselines3 draws there
     first, *_, fifth = [noise() for _ in range(5)]
     noise.reset()
-    assert noise.memory.shape == (1, 2)
-    sixth = noise()
-    generator, whole = np.random.RandomState(0), []
-    for _ in range(3):
-        (memory,) = ColouredNoise().after(beginning(1, 2), 4, generator)
-        assert memory.shape == (4, 2)
-        whole.append(memory.astype(np.float32))
-    for drawn, expected in zip((first, fifth, sixth), whole, strict=True):
-        np.testing.assert_array_equal(drawn, expected[0])
+    for drawn, expected in zip((first, fifth, noise()), firsts, strict=True):
+        np.testing.assert_array_equal(drawn, expected)
 
 
 def test_an_episode_of_one_step_has_noise():
-    (memory,) = ColouredNoise().after(beginning(1, 3), 1, np.random.RandomState(0))
-    assert np.isfinite(memory).all()
+    assert np.isfinite(ColouredNoise().make(3, 1)()).all()

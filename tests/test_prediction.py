@@ -13,7 +13,6 @@ from jbrep.coordinates import wrapped
 from jbrep.dataset import Column, Dataset, ScaledDataset
 from jbrep.encoders import Encoder, Layer
 from jbrep.encoders.header import EncoderHeader
-from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.evaluate import control, diagnose, regression
 from jbrep.evaluate.control import GoodPolicy, PlayedEpisode, lost, needs, returns_to_go
@@ -33,8 +32,7 @@ from jbrep.evaluate.registry import Judged
 from jbrep.evaluate.regression import Networks, Problem, beside, fit
 from jbrep.evaluate.table import headline
 from jbrep.play.sources import find_good_policy
-from jbrep.report.evaluation import evaluation_text, in_words
-from jbrep.report.serving import good_codes, recommended, serving, untold
+from jbrep.report.evaluation import evaluation_text, in_words, judge
 
 NAMES = ("place", "speed", "load", "idle")
 STEPS, EPISODES = 60, 200
@@ -179,57 +177,60 @@ def test_an_evaluation_is_told_in_one_screen(evaluation):
     shown = evaluation_text(evaluation, 80)
     assert max(map(len, shown.splitlines())) <= 80
     assert len(shown.splitlines()) < 24
-    assert shown.startswith("Take without idle: it tells the change of what the reward depends on")
+    assert shown.startswith("Take without idle: ")
     assert re.search(r"without load +load \((<0|0\.\d\d)\)\nwithout idle +nothing", shown)
     assert re.search(r"\nfull +\d+ +0\.\d\d +0\.\d\d \[0\.\d\d, \d\.\d\d\] +0\.\d\d", shown)
+    assert re.search(r"\nwithout load .* no\n", shown)
+    assert re.search(r"\nwithout idle .* yes\n", shown)
 
 
-def test_the_smallest_code_that_lacks_nothing_is_taken(evaluation):
-    good, lost = evaluation.encoders["without idle"], evaluation.encoders["without load"].loses
+def test_the_smallest_code_without_a_loss_is_to_take_and_else_the_smallest(evaluation):
+    good = evaluation.encoders["without idle"]
+    lost = evaluation.encoders["without load"].loses
     codes = {
         "full": evaluation.encoders["full"],
         "large": good.replace(latent=3, loses=()),
         "larger": good.replace(latent=4, loses=()),
         "small": good.replace(latent=2, loses=lost),
     }
-    several = evaluation.replace(encoders=codes)
-    assert (recommended(several), {*good_codes(several)}) == ("large", {"large", "larger", "small"})
+    judged = judge(evaluation.replace(encoders=codes))
+    assert (judged.take, {*judged.serving}) == ("large", {"large", "larger", "small"})
     codes |= {label: codes[label].replace(loses=lost) for label in ("large", "larger")}
-    assert recommended(evaluation.replace(encoders=codes)) == "small"  # which lacks something, too
+    assert judge(evaluation.replace(encoders=codes)).take == "small"
 
 
 def test_nothing_is_said_where_it_cannot_be(evaluation):
     codes = {name: evaluation.encoders[name] for name in ("full", "without load", "noise")}
-    none_serves = evaluation.replace(encoders=codes)
-    assert recommended(none_serves) is None
-    assert "without load comes nearest" in serving(none_serves)
-    full, unknown = codes["full"], Score(None)
+    judged = judge(evaluation.replace(encoders=codes))
+    assert (judged.take, judged.nearest) == (None, "without load")
+    full = codes["full"]
+    unknown = Score(None, None, None)
     still = {k: ahead.replace(reward=unknown) for k, ahead in full.prediction.items()}
     constant = evaluation.replace(
         needs=dict.fromkeys(evaluation.needs, 0.0),
         encoders=codes | {"full": full.replace(prediction=still)},
     )
-    assert untold(constant)
-    assert not re.search(r"noise +nothing", evaluation_text(constant))
+    told = evaluation_text(constant)
+    assert "can't be said: no reward is known that varies over the held-out steps" in told
+    assert not re.search(r"noise +nothing", told)
     blind = {k: a.replace(rewarded=unknown, reward=unknown, mean=unknown) for k, a in still.items()}
     nothing = evaluation.replace(encoders=codes | {"full": full.replace(prediction=blind)})
-    assert good_codes(nothing) == []
+    assert "next to nothing" in judge(nothing).unsaid
     assert evaluation.encoders["without load"].method == {"spectrum": [3.0, 1.0]}
 
 
 def test_the_nearest_code_tells_something_and_lacks_nothing_if_one_does(evaluation):
     def telling(label, r2, loses=()):
         known = evaluation.encoders[label]
-        ahead = known.prediction["10"].replace(rewarded=Score(r2))
+        ahead = known.prediction["10"].replace(rewarded=Score(r2, None, None))
         return known.replace(prediction=known.prediction | {"10": ahead}, loses=loses)
 
     lost = evaluation.encoders["without load"].loses
     codes = {"full": telling("full", 0.9), "a": telling("noise", 0.4, lost)}
     codes |= {"b": telling("noise", 0.3), "c": telling("noise", 0.05)}
-    for nearest in ("b", "a"):
-        assert f"{nearest} comes nearest" in serving(evaluation.replace(encoders=codes))
-        del codes[nearest]
-    assert "comes nearest" not in serving(evaluation.replace(encoders=codes))
+    for nearest in ("b", "a", None):
+        assert judge(evaluation.replace(encoders=codes)).nearest == nearest
+        codes.pop(nearest, None)
 
 
 def test_of_short_episodes_as_many_steps_count_as_are_known(evaluation):
@@ -237,13 +238,12 @@ def test_of_short_episodes_as_many_steps_count_as_are_known(evaluation):
         label: known.replace(prediction={k: known.prediction[k] for k in ("1", "5")})
         for label, known in evaluation.encoders.items()
     }
-    told = evaluation_text(evaluation.replace(encoders=shorter), everything=True)
-    assert told.startswith("Take without idle")
-    assert "Episodes allow to look 5 steps ahead in place of 10." in told
+    judged = judge(evaluation.replace(encoders=shorter))
+    assert judged.take == "without idle"
+    assert "over 5 steps" in judged.by
     blind = {label: known.replace(prediction={}) for label, known in shorter.items()}
     none = evaluation.replace(encoders=blind, needs={})
-    assert recommended(none) is None
-    assert "too short" in untold(none)
+    assert judge(none).unsaid == "episodes are too short to look ahead"
 
 
 def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkeypatch):
@@ -253,7 +253,6 @@ def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkey
     assert not any({"value", "action"} & {*each.scores} for each in result.encoders.values())
     assert "return to go" not in evaluation_text(result)
     assert find_good_policy(None, held_out.data.task) is None
-    assert find_good_policy(None, describe("face_direction"), own_rewards=True) is None
     cut = [PlayedEpisode(np.zeros((101, 4), np.float32), np.ones(100), False)] * 5
     short = GoodPolicy("short", controller, cut)
     assert set(networks(code(held_out.data, "place"), held_out, short).of_policy) == {"action"}

@@ -15,8 +15,7 @@ from PIL import Image
 
 from jbrep.envs import describe
 from jbrep.envs.make import make_env
-from jbrep.envs.mujoco import physics_of
-from jbrep.envs.physics import Motion
+from jbrep.envs.physics import Motion, physics_of
 from jbrep.errors import InputError
 from jbrep.jitterbug.model import plain_model
 from jbrep.play.film import Film, Pace, encode_gif, encode_mp4, get_format

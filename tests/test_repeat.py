@@ -1,12 +1,11 @@
 """Actions that are held for several control steps: in training, and by whoever plays the policy."""
 
-import json
 import shutil
 
 import numpy as np
 import pytest
 from command import jbrep
-from small import assert_same_files, settings
+from small import settings
 
 from jbrep.collect import collect
 from jbrep.dataset import Dataset
@@ -18,7 +17,7 @@ from jbrep.errors import InputError
 from jbrep.play.sources import find_player, find_policy
 from jbrep.rl import Run, train
 from jbrep.rl.agent import Evaluator
-from jbrep.rl.files import EPISODES, EVALUATIONS, POLICY, POLICY_ZIP, read_evaluations
+from jbrep.rl.files import EPISODES, POLICY, POLICY_ZIP, read_evaluations
 from jbrep.rl.from_zip import load_zip
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_file import read
@@ -89,11 +88,11 @@ def test_the_environment_says_how_long_an_episode_was():
         JitterbugVecEnv(TASK, 2, action_repeat=0)
 
 
-@pytest.fixture(scope="module", params=["cohort", "sb3"])
-def run(request, tmp_path_factory):
-    """A run of each trainer with actions that are held, which begins as that of the other."""
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run with actions that are held."""
     small = {"net_arch": [8], "learning_starts": 1000, "num_envs": 2, "train_freq": 1}
-    folder = tmp_path_factory.mktemp("repeat") / request.param
+    folder = tmp_path_factory.mktemp("repeat") / "run"
     what = Run.of(
         TASK,
         "sac",
@@ -103,7 +102,6 @@ def run(request, tmp_path_factory):
         evaluate_every=100,
         evaluation_episodes=3,
         final_episodes=3,
-        trainer=request.param,
     )
     assert train(what, folder).steps == 304  # 38 steps of two robots, of four control steps each
     return folder
@@ -117,16 +115,6 @@ def test_everything_counts_control_steps(run):
         for step in (104, 104, 208, 208)  # 13 actions of two robots, the last cut short
     ]
     assert [*dict.fromkeys(each.step for each in read_evaluations(run))] == [0, 104, 200, 304]
-
-
-def test_both_trainers_begin_alike(run, tmp_path_factory):
-    other = {"cohort": "sb3", "sb3": "cohort"}[run.name]
-    record = json.loads((run / "run.json").read_text())
-    there = tmp_path_factory.mktemp("other") / other
-    chosen = record["settings"]["overrides"]
-    counts = {n: record["settings"][n] for n in ("steps", "evaluate_every", "evaluation_episodes")}
-    train(Run.of(TASK, "sac", "modern", chosen, final_episodes=3, trainer=other, **counts), there)
-    assert_same_files(there, run, EPISODES, EVALUATIONS)
 
 
 def test_whoever_plays_the_policy_holds_its_actions(run, tmp_path):
@@ -165,7 +153,5 @@ def test_a_repeat_out_of_range_is_refused_in_a_line(tmp_path):
     common = ("rl", "--task", "face_direction", "--steps", 100, "--out", tmp_path / "run")
     result = jbrep(*common, "--set", "action_repeat=0")
     assert result.exit_code == 2
-    assert "action_repeat is 0: it must be a whole number from 1 to 1,000" in " ".join(
-        result.output.split()
-    )
+    assert "action_repeat is 0" in " ".join(result.output.split())
     assert not (tmp_path / "run").exists()

@@ -17,6 +17,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import mistake
+from jbrep.report.answer import answer
+from jbrep.report.facts import full_scaling, reproduce, setting_table
+from jbrep.report.markdown import escape, markdown
+from jbrep.report.page import page as page_of
+from jbrep.report.returns import returns_tables
+from jbrep.report.statistics import verdict_tables
 from made_up import STUDY as CLAIMED
 from made_up import make_runs, of_a_commit, write_record
 from small import adopt, assert_same_files, forge
@@ -30,14 +36,8 @@ from jbrep.play.sources import find_episode
 from jbrep.records.document import read_document
 from jbrep.records.tables import write_csv, write_rows
 from jbrep.report import make_report, report, write_report
-from jbrep.report.answer import answer
-from jbrep.report.facts import full_scaling, reproduce, setting_table
 from jbrep.report.figures import study_plots, write
-from jbrep.report.markdown import escape, markdown
-from jbrep.report.page import page as page_of
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, STATISTICS, SUMMARY
-from jbrep.report.returns import returns_tables
-from jbrep.report.statistics import verdict_tables
 from jbrep.report.tables import read_tables
 from jbrep.rl.files import ENCODER, EVALUATIONS, Evaluation, read_run
 from jbrep.stats.rules import Rules

@@ -13,7 +13,6 @@ import time
 import zipfile
 from contextlib import closing, contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,13 +30,11 @@ from jbrep.records import container
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.bar import Bar
-from jbrep.rl.checkpoint import History
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, POLICY, read_evaluations, read_run
 from jbrep.rl.from_zip import load_zip
+from jbrep.rl.history import History
 from jbrep.rl.policy import load_run
 from jbrep.rl.presets import PRESETS, get_preset, sb3_class
-from jbrep.rl.sb3 import restore, take
-from jbrep.rl.settings import COHORT, SB3
 
 STEPS = 100  # of an episode: little depends on its length
 TASK = describe("face_direction", max_episode_steps=STEPS)
@@ -254,10 +251,8 @@ def test_a_run_that_another_process_has_just_finished_is_left_alone(short, tmp_p
         shutil.copytree(short, folder, dirs_exist_ok=True)
         yield
 
-    monkeypatch.setattr("jbrep.rl.trainers.exclusive", wait_for_another_process)
-    monkeypatch.setattr(
-        "jbrep.rl.job.Job.keep_encoder", lambda _: pytest.fail("it was trained again")
-    )
+    monkeypatch.setattr("jbrep.rl.training.exclusive", wait_for_another_process)
+    monkeypatch.setattr("jbrep.rl.training.save", lambda *_: pytest.fail("it was trained again"))
     assert train(SHORT, folder) == read_run(short)
 
 
@@ -299,7 +294,7 @@ def test_a_killed_run_resumes_to_the_same_bits(algorithm, tmp_path):
     spoilt = tmp_path / "spoilt" / "checkpoint.safetensors"
     for content in (written[:-100], b"", pickle.dumps(run), written):
         spoilt.write_bytes(content)
-        with pytest.raises(InputError, match=r"checkpoint\.safetensors (is|belongs)"):
+        with pytest.raises(InputError, match=r"checkpoint\.safetensors is|holds another run: seed"):
             train(run.replace(seed=9), tmp_path / "spoilt")
     assert [p.name for p in spoilt.parent.iterdir() if p.suffix] == [spoilt.name]
 
@@ -307,7 +302,7 @@ def test_a_killed_run_resumes_to_the_same_bits(algorithm, tmp_path):
 def test_a_run_that_is_asked_to_stop_writes_a_checkpoint_and_resumes_from_there(short, tmp_path):
     steps = []
 
-    def watch(job, step):
+    def watch(history, step):
         steps.append(step)
 
     with pytest.raises(StoppedError, match="stopped after 40 steps"):
@@ -354,12 +349,12 @@ def test_a_second_signal_ends_the_command_at_once():
     assert "Ctrl-C again ends at once" in process.stderr
 
 
-def made_up_job(*means):
-    """A run whose evaluations had these mean returns."""
+def made_up(*means):
+    """What is recorded of a run whose evaluations had these mean returns."""
     history = History()
     for number, mean in enumerate(means):
-        history.evaluated(1000 * number, Outcome(np.array([mean - 1, mean + 1]), [{}, {}]))
-    return SimpleNamespace(history=history)
+        history.add(1000 * number, Outcome(np.array([mean - 1, mean + 1]), [{}, {}]))
+    return history
 
 
 class Terminal(io.StringIO):
@@ -389,9 +384,9 @@ def test_a_terminal_shows_the_course_of_the_return(encoding, means, course, monk
     terminal = Terminal(encoding)
     monkeypatch.setattr(sys, "stderr", terminal)
     with closing(Bar(5_000_000, "sac on a-long-name-of-an-encoder")) as bar:
-        bar.show(made_up_job(), 1000)
+        bar.show(made_up(), 1000)
         bar._progress.start_t -= 36_000  # seconds
-        bar.show(made_up_job(*means), 100_000)
+        bar.show(made_up(*means), 100_000)
         bar._progress.refresh()
         line = terminal.getvalue().split("\r")[-1].rstrip()
         assert len(line) < 80
@@ -400,19 +395,16 @@ def test_a_terminal_shows_the_course_of_the_return(encoding, means, course, monk
 
 
 def test_the_rate_after_resuming_counts_the_steps_since():
-    job = made_up_job()
+    history = made_up()
     with closing(Bar(1000, "sac")) as bar:
-        bar.show(job, 500)
-        bar.show(job, 600)
+        bar.show(history, 500)
+        bar.show(history, 600)
         assert (bar._progress.n, bar._progress.initial) == (600, 500)
-        bar.show(job, 1008)
+        bar.show(history, 1008)
         assert (bar._progress.n, bar._progress.postfix) == (1000, "returns=final ones under way")
-        job.history.evaluated(1000, Outcome(np.array([1.5, 2.5]), [{}, {}]))
-        bar.show(job, 1008)
+        history.add(1000, Outcome(np.array([1.5, 2.5]), [{}, {}]))
+        bar.show(history, 1008)
         assert bar._progress.postfix == "returns=2.00"
-    trained, resumed = agent_of("a2c").learn(80), agent_of("a2c").learn(40)
-    restore(resumed, take(trained))
-    assert resumed.num_timesteps == resumed._num_timesteps_at_start == 80
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
@@ -433,13 +425,11 @@ def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
         load_run(tmp_path / "wild")
 
 
-@pytest.mark.parametrize("trainer", [COHORT, SB3])
-def test_a_run_tells_all_its_steps_before_its_last_evaluation(trainer, tmp_path):
+def test_a_run_tells_all_its_steps_before_its_last_evaluation(tmp_path):
     told = []
-    run = Run.of(
-        algorithm="ddpg", steps=1200, evaluate_every=600, trainer=trainer, **QUICK, preset="paper"
-    )
-    train(run, tmp_path / "run", Session(lambda job, step: told.append((step, job.history.mean))))
+    run = Run.of(algorithm="ddpg", steps=1200, evaluate_every=600, **QUICK, preset="paper")
+    session = Session(lambda history, step: told.append((step, [0, *history.means][-1])))
+    train(run, tmp_path / "run", session)
     evaluations = read_evaluations(tmp_path / "run")
     means = [np.mean([e.episode_return for e in evaluations if e.step == s]) for s in (600, 1200)]
     assert means[0] != means[1]
@@ -447,7 +437,7 @@ def test_a_run_tells_all_its_steps_before_its_last_evaluation(trainer, tmp_path)
 
 
 def test_an_error_whose_words_sound_like_divergence_is_not_taken_for_it(tmp_path):
-    def watch(job, step):
+    def watch(history, step):
         raise ValueError("found invalid values: actions are not finite")
 
     with pytest.raises(ValueError, match="found invalid values"):
@@ -518,8 +508,8 @@ def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
             "preset wide is for ddpg, td3, sac, tqc, crossq, not a2c: choose one of paper, modern",
         ),
         ({"encoder": "dae-9"}, "no encoder 'dae-9'"),
-        ({"seed": 2**31}, "seed is 2147483648: it must be a whole number from 0"),
-        ({"steps": 0}, "steps is 0: it must be a whole number from 1 to 1,000,000,000,000"),
+        ({"seed": 2**31}, "seed is 2147483648"),
+        ({"steps": 0}, "steps is 0"),
         ({"steps": 10**23}, f"steps is {10**23}: it must be"),
         ({"evaluate_every": -1}, "evaluate_every is -1"),
         ({"evaluation_episodes": 10_001}, "evaluation_episodes is 10001: .* 1 to 10,000"),

@@ -4,10 +4,8 @@ import functools
 import hashlib
 import json
 import operator
-import os
 import pickle
 import shutil
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +13,14 @@ import pytest
 from command import jbrep, mistake, refused
 from made_up import write_checkpoint
 from small import ONE_EACH, adopt, forge
-from stable_baselines3 import A2C
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jbrep.encoders import find, save
 from jbrep.envs import describe
-from jbrep.errors import InputError
 from jbrep.play.sources import find_player
 from jbrep.records import container
 from jbrep.records.record import to_plain
 from jbrep.rl import Run, Session, train
-from jbrep.rl.agent import make_env
 from jbrep.rl.files import (
     CHECKPOINT,
     ENCODER,
@@ -33,17 +28,12 @@ from jbrep.rl.files import (
     POLICY,
     POLICY_ZIP,
     RUN,
-    PolicyHeader,
-    is_policy_file,
     read_evaluations,
     read_run,
 )
-from jbrep.rl.from_zip import load_zip
-from jbrep.rl.job import Scalars
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_file import read
-from jbrep.rl.trained import of_file
-from jbrep.study.results import write_tables
+from jbrep.rl.training import Scalars
 
 TASK = describe("face_direction")
 SETTINGS = Run.of(
@@ -112,81 +102,48 @@ def shorten(folder, episode_steps=30, **others):
     change(folder, settings={**settings, "environment": environment, **others})
 
 
-ODD = (
-    *(None, True, -1, 0, 1.5, 10**30, float("nan"), float("inf"), "", "x", "x" * 2000, "\x1b[2J"),
-    *("\ud800", "../../up", [], [[]], [10**9], ["x"], {}, {"x": 10**30}, {"x": float("nan")}),
-)
-
-
-def mutations(record):
-    """The record with each field, of settings and their parts too, missing or of odd values."""
-    settings = record["settings"]
-    paths = [(name,) for name in record] + [("settings", name) for name in settings]
-    for part in ("environment", "hyperparameters"):
-        paths += [("settings", part, name) for name in settings[part]]
-    for path in paths:
-        for value in (..., *ODD):
-            mutant = json.loads(json.dumps(record))
-            parent = functools.reduce(operator.getitem, path[:-1], mutant)
-            if value is ...:
-                del parent[path[-1]]
-            else:
-                parent[path[-1]] = value
-            yield mutant
-
-
-def write_mutant(path, mutant):
-    """As a stranger would, where a checksum of such a thing can be."""
-    try:
-        forge(path, mutant)
-    except ValueError:
-        path.write_text(json.dumps(mutant))
-
-
-def attempt(use, folder):
-    """What it gives; None if it refuses, in one line."""
-    try:
-        return use(folder)
-    except InputError as error:
-        message = str(error)
-    assert message.isprintable()
-    return None
-
-
-def test_every_field_of_a_run_is_checked(run):
-    """Whatever run.json says, it is refused in one line, or can be used by all who read it."""
-    record = json.loads((run / RUN).read_text())
-    known = {None, read_run(run).text()}
-    for mutant in mutations(record):
-        write_mutant(run / RUN, mutant)
-        content = attempt(read_run, run)
-        text = content and content.text()
-        if text not in known:
-            known.add(text)
-            attempt(load_run, run)
-            attempt(write_tables, run)
-    assert 20 < len(known) < 100  # most are refused
+def changed(record, path, value):
+    """The record with a field, of settings and their parts too, missing or of another value."""
+    mutant = json.loads(json.dumps(record))
+    *parents, name = path
+    parent = functools.reduce(operator.getitem, parents, mutant)
+    parent[name] = value
+    if value is ...:
+        del parent[name]
+    return mutant
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("path", "value"),
     [
-        (b"[]", "it must be an object"),
-        (b'{"format": "jbrep run", "format_version": 5}', "is missing"),
-        (b'{"format": "jbrep run", "format_version": 4}', "version 4 of the jbrep run format"),
+        (("steps",), ...),
+        (("status",), "x"),
+        (("tables",), {}),
+        (("settings", "seed"), -1),
+        (("settings", "environment", "id"), "../../up"),
+        (("settings", "hyperparameters", "num_envs"), 10**30),
     ],
+    ids=str,
 )
-def test_a_run_file_of_anything_else(content, message, run):
+def test_a_field_of_a_run_that_cant_be_is_named(path, value, run):
+    record = json.loads((run / RUN).read_text())
+    forge(run / RUN, changed(record, path, value))
+    told = refused(read_run, run)
+    assert RUN in told
+    assert path[-1] in told
+
+
+@pytest.mark.parametrize("content", [b"[]", b'{"format": "jbrep run", "format_version": 7}'])
+def test_a_run_file_of_anything_else(content, run):
     (run / RUN).write_bytes(content)
-    assert message in refused(read_run, run)
+    assert RUN in refused(read_run, run)
     for command in (("evaluate-policy", run), ("report", run), ("inspect", run)):
         mistake(*command)
 
 
 NO_EVALUATIONS = (
-    *("", "0,0", "0,0,1,2", "0,0,nan", "0,0,inf", f"{10**30},0,1", f"{10**13},0,1", "-1,0,1"),
-    *(f"0,{10**8},1", "0,1,1", "0,0,1\n0,1,1\n80,0,1", "0,0,1\n40,0,1\n40,1,1\n80,0,1"),
-    *("80,0,1\n0,0,1", "0,0,1\n0,0,1", "0,0,1\n" + "9" * 200_000, '0,0,"1', "\0"),
+    *("", "0,0", "0,0,1,2", "0,0,nan", f"{10**30},0,1", "-1,0,1", f"0,{10**8},1", "0,1,1"),
+    *("0,0,1\n0,1,1\n80,0,1", "80,0,1\n0,0,1", "0,0,1\n0,0,1", '0,0,"1', "\0"),
 )
 
 
@@ -214,50 +171,38 @@ LOG_STD = "policy.log_std"
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    "make",
     [
-        (lambda tensors: {}, "doesn't fit the run's settings"),
-        (lambda tensors: without(tensors, "policy.action_net.bias"), "doesn't fit"),
-        (lambda tensors: {**tensors, "policy.more": np.ones(1, np.float32)}, "doesn't fit"),
-        (lambda tensors: {**tensors, LOG_STD: np.ones(3, np.float32)}, "doesn't fit"),
-        (
-            lambda tensors: {**tensors, LOG_STD: np.full(1, np.nan, np.float32)},
-            "weights are not finite",
-        ),
+        lambda tensors: without(tensors, "policy.action_net.bias"),
+        lambda tensors: {**tensors, "policy.more": np.ones(1, np.float32)},
+        lambda tensors: {**tensors, LOG_STD: np.ones(3, np.float32)},
+        lambda tensors: {**tensors, LOG_STD: np.full(1, np.nan, np.float32)},
     ],
-    ids=range(5),
+    ids=range(4),
 )
-def test_a_policy_that_isn_t_the_run_s(make, message, run):
+def test_a_policy_that_isn_t_the_run_s(make, run):
     """Its hashes are right: a stranger can work them out."""
     forge_policy(run, make(weights_of(run)))
-    assert message in refused(load_run, run)
+    assert POLICY in refused(load_run, run)
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda raw: raw[:-1] + bytes([raw[-1] ^ 1]), "its checksum doesn't match"),
-        (lambda raw: raw[:-40], "is not a jbrep policy, or is truncated"),
-        (lambda raw: b"PK", "is not a jbrep policy, or is truncated"),
-        (pickle.dumps, "is not a jbrep policy, or is truncated"),
-    ],
+    "make",
+    [lambda raw: raw[:-1] + bytes([raw[-1] ^ 1]), lambda raw: raw[:-40], pickle.dumps],
+    ids=["a bit", "cut short", "pickled"],
 )
-def test_a_policy_s_file_that_is_none(make, message, run):
+def test_a_policy_s_file_that_is_none(make, run):
     content = make((run / POLICY).read_bytes())
     (run / POLICY).write_bytes(content)
     change(run, policy_sha256=hashlib.sha256(content).hexdigest())
-    assert message in refused(load_run, run)
+    assert POLICY in refused(load_run, run)
 
 
-def test_every_field_of_a_policy_s_header_is_checked(run):
+@pytest.mark.parametrize(("name", "value"), [("settings", {}), ("step", -1), ("finished", "x")])
+def test_a_field_of_a_policy_s_header_that_cant_be_is_named(name, value, run):
     tensors, header = container.read(run / POLICY, "policy")
-    allowed = {"finished": [True], "run": ["", "x", "../../up"], "step": [0]}
-    for name in header:
-        for value in (..., *ODD):
-            other = {key: each for key, each in {**header, name: value}.items() if each is not ...}
-            container.write(run / POLICY, tensors, other)
-            used = attempt(lambda path: of_file(read(path)), run / POLICY)
-            assert (used is None) == (value not in allowed.get(name, [])), (name, value)
+    container.write(run / POLICY, tensors, {**header, name: value})
+    assert name in refused(read, run / POLICY)
 
 
 def test_weights_too_large_to_act_with_are_refused(run):
@@ -269,35 +214,6 @@ def test_weights_too_large_to_act_with_are_refused(run):
         run, {n: np.float32(1e38) * sign if n[0] == "p" else sign for n, sign in signs.items()}
     )
     assert "the policy's actions are not finite" in mistake("evaluate-policy", run, "--episodes", 1)
-
-
-@pytest.mark.parametrize("name", [RUN, POLICY, ENCODER, EVALUATIONS])
-def test_files_that_are_not_regular_are_not_opened(name, run):
-    """A pipe that nobody fills would hang, a link to /dev/zero would never end."""
-    path = run / name
-    for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero"), Path.mkdir):
-        path.unlink()
-        make(path)
-        errors = []
-        use = read_evaluations if name == EVALUATIONS else load_run
-        thread = threading.Thread(target=lambda: errors.append(refused(use, run)), daemon=True)  # noqa: B023
-        thread.start()
-        thread.join(timeout=30)
-        assert name in errors[0]
-        if path.is_dir():
-            path.rmdir()
-            path.touch()
-
-
-def test_a_file_from_elsewhere_must_be_a_regular_one(tmp_path):
-    path = tmp_path / "agent.zip"
-    for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
-        make(path)
-        assert "must be a regular file" in refused(load_zip, path, TASK, "a2c", "dae-8", True)
-        path.unlink()
-    A2C("MlpPolicy", make_env(TASK, 1, 0, find("dae-8", TASK))).save(tmp_path / "real.zip")
-    path.symlink_to(tmp_path / "real.zip")
-    assert load_zip(path, TASK, "a2c", "dae-8", trust=True).trained.task == TASK
 
 
 def test_a_run_under_way_plays_its_checkpoint(under_way, trained):
@@ -318,13 +234,13 @@ def test_a_run_under_way_plays_its_checkpoint(under_way, trained):
 def test_a_checkpoint_s_policy_is_the_agent_s_at_that_step(trained, tmp_path):
     """A run that ends where the other's checkpoint was written has the same policy."""
     train(SETTINGS.replace(steps=40), tmp_path)
-    ours = container.read(trained.with_name(CHECKPOINT), "checkpoint", 1 << 30)[0]
+    ours = container.read(trained.with_name(CHECKPOINT), "checkpoint")[0]
     for name, value in weights_of(tmp_path).items():
         if name.startswith("policy."):
             np.testing.assert_array_equal(ours[f"parameters.{name}"], value)
 
 
-@pytest.mark.parametrize("algorithm", ["ddpg", "sac", "td3", "ppo", "trpo"])
+@pytest.mark.parametrize("algorithm", ["ddpg", "sac", "ppo"])
 def test_the_checkpoint_of_every_algorithm_is_played(algorithm, tmp_path):
     agent = write_checkpoint(
         tmp_path, Run.of(TASK, algorithm, encoder="dae-8", seed=3, preset="paper"), step=7
@@ -340,33 +256,26 @@ def test_the_checkpoint_of_every_algorithm_is_played(algorithm, tmp_path):
 
 def spoilt(header):
     for name in ("settings", "counters", "episodes", "versions"):
-        for value in (None, [1], "x"):
-            yield {**header, name: value}
-    for name in ("task", "hyperparameters", "seed", "evaluation_episodes"):
-        yield {**header, "settings": {**header["settings"], name: 10**30}}
-    for value in (-1, 1.5, "x"):
-        yield {**header, "step": value}
-        yield {**header, "counters": {**header["counters"], "num_timesteps": value}}
+        yield {**header, name: "x"}
+    yield {**header, "settings": {**header["settings"], "seed": 10**30}}
+    yield {**header, "step": -1}
 
 
 def test_a_damaged_checkpoint_is_named(under_way):
     path = under_way / CHECKPOINT
-    tensors, header = container.read(path, "checkpoint", 1 << 30)
+    tensors, header = container.read(path, "checkpoint")
     for changed in spoilt(header):
         container.write(path, tensors, changed)
         assert CHECKPOINT in refused(load_run, under_way)
     container.write(path, without(tensors, "parameters.policy.log_std"), header)
     assert "doesn't fit the run's settings" in refused(load_run, under_way)
-    nan = {**tensors, "parameters.policy.log_std": np.full(1, np.nan, np.float32)}
-    container.write(path, nan, header)
-    assert "not finite" in refused(load_run, under_way)
     path.write_bytes(path.read_bytes()[:100])
     assert CHECKPOINT in refused(load_run, under_way)
 
 
 def test_a_checkpoint_that_nothing_can_go_on_from_is_named(under_way):
     path = under_way / CHECKPOINT
-    tensors, header = container.read(path, "checkpoint", 1 << 30)
+    tensors, header = container.read(path, "checkpoint")
     kind, *others = header["counters"]["numpy"]
     counters = {**header["counters"], "numpy": [kind, 10**30, *others[1:]]}
     container.write(path, tensors, {**header, "counters": counters})
@@ -442,15 +351,6 @@ def test_another_encoder_is_not_the_run_s(run):
     assert "was made for face_direction" in refused(load_run, run)
 
 
-def test_a_large_policy_is_recognised(tmp_path):
-    path = tmp_path / "large.safetensors"
-    weights = {"policy.weight": np.zeros((2200, 2200), np.float32)}  # 19 MB
-    container.write(path, weights, {"format": PolicyHeader.format})
-    assert is_policy_file(path)
-    path.write_bytes(path.read_bytes()[:100])
-    assert not is_policy_file(path)
-
-
 def test_tensorboard_keeps_what_was_logged_at_the_step_of_a_checkpoint(tmp_path):
     for step in (0, 20):  # before it was stopped, and after
         scalars = Scalars(tmp_path, step)
@@ -459,9 +359,3 @@ def test_tensorboard_keeps_what_was_logged_at_the_step_of_a_checkpoint(tmp_path)
         scalars.close()
     events = EventAccumulator(str(tmp_path)).Reload()
     assert [e.step for e in events.Scalars("evaluation")] == [20, 40, 50]
-
-
-def test_the_header_of_a_run_of_very_many_episodes_is_seen(tmp_path):
-    episodes = "x" * (17 << 20)
-    container.write(tmp_path / "it.safetensors", {}, {"episodes": episodes})
-    assert container.peek(tmp_path / "it.safetensors") == {"episodes": episodes}

@@ -5,11 +5,10 @@ import pytest
 
 from jbrep.coordinates import make_coordinates
 from jbrep.encoders import Encoder
-from jbrep.encoders.layers import run
+from jbrep.encoders.layers import dense, run
 from jbrep.errors import InputError
 from jbrep.methods.fit import Fitter
 from jbrep.methods.held_out import lost as lost_rows
-from jbrep.methods.linear import dense
 from jbrep.methods.shape import complete
 from jbrep.training.method import Made
 from jbrep.training.network import ARCHITECTURES, layers, stacks

@@ -7,7 +7,7 @@ import pytest
 from deeptime.decomposition import TICA, VAMP
 from scipy.linalg import eigh, sqrtm
 
-from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.dataset import ScaledDataset, from_arrays
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.methods import passes
@@ -33,7 +33,7 @@ def system(folder, actions=None, lengths=(60, 300, 1, 200, 15, 400, 350), extra=
         reward, ends = rows[:, 0] ** 2, np.zeros(length, bool)
         for part, values in zip(parts, (rows, taken, reward, ends), strict=True):
             part.append(values)
-    return ScaledDataset(Dataset.write(folder, *parts))
+    return ScaledDataset(from_arrays(folder, *parts))
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,6 @@ def test_one_lag_is_deeptimes(still, kind, theirs, lag):
     theirs = sorted(model.singular_values, reverse=True)  # by magnitude, there
     np.testing.assert_allclose(spectrum, theirs, atol=1e-9)
     assert same_space(ours.encoder[0].weight, model.singular_vectors_left[:, :2].T)
-    assert ours.metrics["spectra"][str(lag)] == pytest.approx(spectrum, abs=1e-9)
 
 
 def test_slow_features_of_a_robot_are_deeptimes(data):
@@ -87,7 +86,6 @@ def test_slow_features_of_a_robot_are_deeptimes(data):
     model = estimator.fit_from_timeseries([rows for rows, _, _ in episodes(data)]).fetch_model()
     np.testing.assert_allclose(ours.metrics["spectrum"][:6], model.singular_values[:6], atol=1e-9)
     assert same_space(ours.encoder[0].weight, model.singular_vectors_left[:, :6].T)
-    assert all(max(spectrum) <= 1 for spectrum in ours.metrics["spectra"].values())
 
 
 def test_slow_features_of_several_lags_are_those_of_all_their_pairs(moved):
@@ -104,7 +102,6 @@ def test_slow_features_of_several_lags_are_those_of_all_their_pairs(moved):
     ours = made(moved, "slow", lags=(2, 20), latent=2)
     assert ours.metrics["spectrum"] == pytest.approx(values[::-1], abs=1e-9)
     assert same_space(ours.encoder[0].weight, vectors[:, ::-1][:, :2].T)
-    assert list(ours.metrics["spectra"]) == ["1", "2", "5", "10", "20"]
     code = run(ours.encoder, first.astype(np.float32))
     np.testing.assert_allclose(code.T @ code / len(code), np.eye(2) / 9, atol=1e-5)
 
@@ -133,9 +130,9 @@ def test_vamp_is_the_canonical_correlation_that_the_actions_leave(moved):
 
 
 def test_vamp_of_several_lags_has_the_mean_of_squares(moved):
-    both = made(moved, "vamp", lags=(2, 10)).metrics
-    squares = [np.square(both["spectra"][lag]).sum() for lag in ("2", "10")]
-    assert np.square(both["spectrum"]).sum() == pytest.approx(np.mean(squares))
+    spectra = [made(moved, "vamp", lags=lags).metrics["spectrum"] for lags in ((2, 10), 2, 10)]
+    both, *each = [np.square(spectrum).sum() for spectrum in spectra]
+    assert both == pytest.approx(np.mean(each), rel=0.01)  # lag 2 alone has more windows
 
 
 @pytest.mark.parametrize("weights", [{"values": 0}, {"changes": 2, "reward": 0.5}])
@@ -209,7 +206,7 @@ def test_a_block_stays_small_where_most_episodes_are_too_short(tmp_path, monkeyp
         ),
         (
             {"kind": "linear-forward", "changes": 0, "values": 0, "reward": 0},
-            "nothing to predict: all its weights are 0",
+            "nothing that linear-forward is to predict varies",
         ),
     ],
 )
@@ -256,7 +253,7 @@ def test_the_unit_of_the_reward_does_not_matter(kind, moved, tmp_path):
     found = []
     for unit in (1, 2.0**-40):
         columns = source["observation"][:], source["action"][:], source["reward"][:] * unit
-        data = Dataset.write(tmp_path / f"data-{unit}", *columns, ends)
+        data = from_arrays(tmp_path / f"data-{unit}", *columns, ends)
         found.append(Fitter(data, tmp_path / f"{unit}").fit(kind, **how).encoder)
     one, tiny = (each.encoder[0].weight for each in found)
     assert one.tobytes() == tiny.tobytes()
@@ -267,7 +264,7 @@ def test_rewards_that_never_vary_say_nothing(tmp_path, still):
     columns = [source["observation"][:], source["action"][:], np.ones(len(source))]
     ends = np.zeros(len(source), bool)
     ends[np.cumsum(source.episodes["length"]) - 1] = True
-    same = ScaledDataset(Dataset.write(tmp_path / "same", *columns, ends))
+    same = ScaledDataset(from_arrays(tmp_path / "same", *columns, ends))
     with pytest.raises(InputError, match="nothing that linear-forward is to predict varies"):
         made(same, "linear-forward", changes=0, values=0, latent=2)
     assert made(same, "linear-forward", horizons=(1, 5), latent=4).metrics["spectrum"][3] > 0

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from jbrep.report.returns import return_form
+from jbrep.report.statistics import statistics_text
 from scipy import optimize, stats
 
 from jbrep.errors import InputError
-from jbrep.report.returns import return_form
-from jbrep.report.statistics import statistics_text
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.aggregates import aggregates
 from jbrep.stats.analysis import to_plain
@@ -152,25 +152,13 @@ def shapes(n, random, studies=3000):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"seed": None}, "its seed is None; it must be a whole number"),
-        ({"seed": True}, "its seed is True"),
-        ({"steps": GRID.astype(float)}, "its steps are float64; they must be whole numbers"),
-        ({"steps": GRID[::-1], "returns": np.ones((11, 3))}, "its steps don't ascend"),
-        ({"returns": np.ones(11)}, r"shape \(11,\); expected \(evaluations, episodes\), with 11"),
-        ({"returns": np.ones((1, 11))}, r"shape \(1, 11\)"),
-        (
-            {"returns": np.full((11, 3), np.nan)},
-            r"returns aren't finite, or beyond 1e\+15; set failed_at",
-        ),
-        ({"returns": np.full((11, 3), -1e16)}, "returns aren't finite, or beyond"),
         ({"returns": np.full((11, 3), -1.0)}, "least return is -1; its task has none below 0"),
         ({"return_ceiling": 400.0}, r"largest return is \d+(\.\d+)?; its task has none above 400"),
         ({"final": np.full(5, -9.0)}, "least return is -9; its task has none below 0"),
-        ({"return_floor": -np.inf}, "its return_floor is -inf; give a number, or None if unknown"),
-        ({"solved": np.nan}, "its solved is nan"),
-        ({"steps": [10_000], "returns": np.ones((1, 9))}, "evaluations is 1; a curve needs"),
-        ({"total_steps": 9000}, "at steps 0 to 10000; they must be within its total_steps, 9000"),
-        ({"failed_at": 20_000}, "failed at step 20000; that must be within 0 to 10000"),
+        (
+            {"steps": np.array([10_000]), "returns": np.ones((1, 9))},
+            "evaluations is 1; a curve needs",
+        ),
     ],
 )
 def test_invalid_runs_are_refused(changes, message):
@@ -180,15 +168,7 @@ def test_invalid_runs_are_refused(changes, message):
     assert "\n" not in str(raised.value)
 
 
-def test_a_run_cannot_be_changed():
-    returns = np.ones((11, 3))
-    run = make(returns=returns)
-    returns[:] = 2
-    assert run.returns.max() == 1
-    with pytest.raises(ValueError, match="read-only"):
-        run.returns[0] = 5
-
-
+NONE = np.zeros(0, np.int64)
 TWO = [make(seed=0), make(seed=1)]
 
 
@@ -196,7 +176,6 @@ TWO = [make(seed=0), make(seed=1)]
     ("runs", "message"),
     [
         ([], "there are no runs"),
-        (np.ones((10, 30)), "runs contain a ndarray: give one RunCurve for each"),
         ([*TWO, make("dae-8")], "face_direction/sac/dae-8 has one seed: train at least two"),
         ([*TWO, make(seed=1, level=9)], "face_direction/sac/full has seed 1 twice"),
         ([*TWO, make(seed=2, settings="b2")], "mixes the settings a1, b2"),
@@ -204,11 +183,14 @@ TWO = [make(seed=0), make(seed=1)]
         ([*TWO, make("dae-8", 0, task="x"), make("dae-8", 1, task="x")], "x/sac has no runs of"),
         ([*TWO, make(seed=2, solved=None)], "its runs say different solved: 900.0, None; give one"),
         (
-            [make(seed=i, steps=[], returns=[], failed_at=0, return_floor=None) for i in range(2)],
+            [
+                make(seed=i, steps=NONE, returns=np.ones((0, 1)), failed_at=0, return_floor=None)
+                for i in range(2)
+            ],
             "face_direction/sac: every run failed before its first evaluation",
         ),
         (
-            [*TWO, make(seed=2, steps=[10_000, 12_000], total_steps=12_000)],
+            [*TWO, make(seed=2, steps=np.array([10_000, 12_000]), total_steps=12_000)],
             "one run end at step 10000, those of another begin at 10000",
         ),
     ],
@@ -236,7 +218,7 @@ def test_runs_with_other_grids_are_compared_where_all_have_evaluations():
 
 def test_a_failed_run_counts_as_zero_and_does_not_shorten_the_others():
     failed = make(seed=2, steps=GRID[:5], failed_at=3500)
-    never = make(seed=3, steps=[], returns=[], failed_at=10, total_steps=5000)
+    never = make(seed=3, steps=NONE, returns=np.ones((0, 1)), failed_at=10, total_steps=5000)
     grid, cut = common_grid({"full": [*TWO, failed, never]})
     np.testing.assert_array_equal(grid, GRID)
     assert cut is None
@@ -251,7 +233,7 @@ def test_a_failed_run_counts_as_zero_and_does_not_shorten_the_others():
 
 
 def test_a_label_whose_runs_all_failed_is_described():
-    failed = [make("dae-8", i, steps=[], returns=[], failed_at=0) for i in range(3)]
+    failed = [make("dae-8", i, steps=NONE, returns=np.ones((0, 1)), failed_at=0) for i in range(3)]
     found = analyse([*TWO, *failed])
     assert found.groups[0].labels[1].numbers["final_return_mean"].tolist() == [0, None, None]
     alone = analyse([replace(run, representation="full") for run in failed])
@@ -261,7 +243,7 @@ def test_a_label_whose_runs_all_failed_is_described():
 
 def test_what_gains_count_over_is_of_the_starts_of_runs_that_were_evaluated():
     runs = [make(seed=i, returns=np.full((len(GRID), 5), 300.0)) for i in range(3)]
-    early = make(seed=0, steps=[], returns=[], failed_at=0)
+    early = make(seed=0, steps=NONE, returns=np.ones((0, 1)), failed_at=0)
     played = {"face_direction": {"random": [900.0, 0, 0, 0, 0]}}
     (group,) = analyse(
         [early, *(replace(run, seed=run.seed + 1) for run in runs)], references=played

@@ -25,6 +25,7 @@ from command import (
     wait_for_the_end_of,
     workers_of,
 )
+from jbrep.report.statistics import results_text
 from small import adopt, forge
 
 from jbrep.dataset import Dataset
@@ -33,14 +34,13 @@ from jbrep.envs import describe
 from jbrep.errors import DamageError, InputError
 from jbrep.play.sources import find_player, find_untrained
 from jbrep.report.report import statistics
-from jbrep.report.statistics import results_text
 from jbrep.report.tables import read_tables
 from jbrep.rl.files import CHECKPOINT, RUN, read_run
 from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.stats.rules import Rules
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, as_study, read_study
-from jbrep.study.packing import forecast
+from jbrep.study.forecast import forecast
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.prepare import check, prepare
 from jbrep.study.record import runs_record
@@ -125,7 +125,7 @@ def test_a_study_from_toml(tmp_path):
     [
         ("task = 7", "unknown task: it must be one of steps, .*, tasks, algorithms"),
         ('tasks = ["fly"]', "unknown task 'fly'"),
-        ('tasks = [".."]', "unknown task '..': it must be a name or a Gymnasium id"),
+        ('tasks = [".."]', "unknown task '..'"),
         ('tasks = ["my_robots:Robot-v0"]', "only; elsewhere give the id alone, and --import"),
         (
             'tasks = ["Robots/Ant-v0", "Robots-Ant-v0"]',
@@ -141,25 +141,25 @@ def test_a_study_from_toml(tmp_path):
             for name in ("fit-8", "dae-wide-8", "pca", "pca-08", "pca-0", "pca-deep-8", "full-8")
         ),
         ('representations = ["full", "full"]', "representations is .*each once"),
-        ("seeds = []", r"seeds is \[\]: it must be a list of whole"),
-        ("seeds = 0", r"seeds is 0: it must be a list of whole numbers, or how many \(1 to 65,535"),
-        ("seeds = [0.5]", r"seeds\[0\] is 0.5: it must be a whole number from 0"),
-        ("seeds = true", "seeds is True: it must be a list of whole numbers"),
-        ("seeds = [-1]", r"seeds\[0\] is -1: it must be a whole number"),
+        ("seeds = []", r"seeds is \[\]"),
+        ("seeds = 0", r"seeds is 0"),
+        ("seeds = [0.5]", r"seeds\[0\] is 0.5"),
+        ("seeds = true", "seeds is True"),
+        ("seeds = [-1]", r"seeds\[0\] is -1"),
         ("steps = 0", "steps is 0: it must be"),
         ("learners = {}", "unknown 'learners': settings of an algorithm are in algorithms.NAME"),
         (f"steps = {10**23}", "steps"),
-        ("steps = '80'", "steps is '80': it must be a whole number"),
+        ("steps = '80'", "steps is '80'"),
         (
             "evaluation_episodes = 5\nfinal_episodes = 2",
             "final_episodes is 2: it must be as many as evaluation_episodes, 5, or more",
         ),
         ('domain = {delay = "2..0"}', r"delay is 2\.\.0: swap them"),
         ("episode_steps = 1.5", "episode_steps is 1.5: it must be a whole"),
-        ("environment = 7", "environment is 7: it must be a table"),
+        ("environment = 7", "environment is 7"),
         ("environment = {g = 1979-05-27}", "environment has a date, or a num"),
         ("environment = {g = inf}", "environment has a date, or a num"),
-        ("data = 7", "data is 7: it must be a table"),
+        ("data = 7", "data is 7"),
         ("data = {rows = 7}", "unknown data.rows"),
         ("data = {}", "data: it must have either steps"),
         ('data = {folder = "it", sets = 2}', "sets is 2: it is left out where there is a folder"),
@@ -169,9 +169,9 @@ def test_a_study_from_toml(tmp_path):
             for training, message in [
                 ("{depth = 3}", "unknown training.depth: it must be one of epochs, "),
                 ("{latent = 3}", "unknown training.latent"),
-                ("{epochs = 'many'}", "training.epochs is 'many': it must be a whole number"),
+                ("{epochs = 'many'}", "training.epochs is 'many'"),
                 ("{epochs = 0}", "epochs"),
-                ("7", "training is 7: it must be a table"),
+                ("7", "training is 7"),
             ]
         ),
         ("steps 80", "is not valid TOML"),
@@ -214,7 +214,7 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
     assert few[1].startswith("sac-wide learns from step 25,600 on: ")
     assert TINY.replace(data={"": Data(steps=1000)}).notices == TINY.notices[:1]
     path = written(tmp_path, f"representations = {json.dumps(representations)}")
-    monkeypatch.setattr("jbrep.study.packing.estimate", lambda run: 60)
+    monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
     assert "This study compares nothing: it has one" in told.stderr
     assert max(map(len, told.stderr.splitlines())) <= 80
@@ -428,7 +428,7 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
 
 def test_each_run_says_which_module_is_not_here(tmp_path):
     plan = Plan(TINY.replace(representations=("full",)), tmp_path)
-    ended = work(plan.assigned(plan.cells), modules=["robots_elsewhere"])
+    ended = [work(plan.assigned(cell), modules=["robots_elsewhere"]) for cell in plan.cells]
     assert [each.status for each in ended] == ["crashed"] * 2
     assert all("can't import robots_elsewhere" in each.message for each in ended)
 
@@ -443,15 +443,6 @@ def tables_with(plan, folder, runs, **settings):
     return read_tables(folder)
 
 
-def test_runs_of_different_trainers_are_compared_on_request(done, tmp_path):
-    results = tables_with(done, tmp_path, "pca-8/*", trainer="cohort")
-    assert results.analysis is None
-    trainers = "trainers: cohort float32 cpu, sb3 float32 cpu; report those of one"
-    assert trainers in results.left_out[0]
-    assert read_tables(tmp_path, across_trainers=True).analysis
-    assert jbrep("report", tmp_path, "--across-trainers", "--json").exit_code == 0
-
-
 @pytest.mark.usefixtures("one_figure")
 def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     """And reported before: test_whole resumes killed ones."""
@@ -460,7 +451,7 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     finished, begun, *_ = plan.cells
     shutil.copytree(done.folder_of(finished), plan.folder_of(finished))
     stop = iter((False, True)).__next__  # after its first rollout
-    assert work(plan.assigned([begun]), stop) is None
+    assert work(plan.assigned(begun), stop) is None
     assert (plan.folder_of(begun) / CHECKPOINT).exists()
     reported = jbrep("report", out, "--json")
     assert reported.exit_code == 0, reported.output

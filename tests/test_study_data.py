@@ -16,7 +16,7 @@ from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.rl.shipped import file_of
 from jbrep.study.config import Data, as_study
-from jbrep.study.costs import costs
+from jbrep.study.forecast import costs
 from jbrep.study.plan import Plan
 from jbrep.study.prepare import check, prepare
 
@@ -65,8 +65,7 @@ def test_representations_are_made_from_their_own_data(made):
         assert headers["pca-4"].data["policy"]["kind"] == "uniform"
         assert headers["late-s1"].data["policy"]["kind"] == "mixture"
         for name, number, table in (("pca-4", 0, "apart"), ("late-s1", 1, "mixed")):
-            manifest = read_manifest(made.data(task, number, table))
-            assert manifest.fingerprint == seen[name]
+            assert Dataset(made.data(task, number, table)).fingerprint == seen[name]
 
 
 def test_data_hold_what_the_mixture_says(made):
@@ -244,7 +243,7 @@ def test_what_is_made_first_is_estimated(made, tmp_path):
 
 
 def test_a_dry_run_shows_what_is_made_first(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.study.packing.estimate", lambda runs: 60)
+    monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
     study = TINY.replace(data={"": Data(steps=300)})
     (tmp_path / "it.toml").write_text(study.toml())
     told = jbrep("study", tmp_path / "it.toml", "--out", tmp_path / "out", "--dry-run")

@@ -41,10 +41,6 @@ def test_a_curve_goes_from_the_least_to_the_largest():
     assert (sparkline([5, 5], 5), sparkline([], 5)) == ("▁▁", "")
 
 
-def test_a_table_without_a_width_is_whole():
-    assert table(HEADER, ROWS).splitlines()[0] == "encoder  error  ratio  worst feature"
-
-
 def test_a_table_that_is_too_wide_is_cut_into_parts_that_fit_with_every_cell_once():
     shown = table(HEADER, ROWS, width=24)
     assert max(map(len, shown.splitlines())) <= 24
@@ -53,10 +49,6 @@ def test_a_table_that_is_too_wide_is_cut_into_parts_that_fit_with_every_cell_onc
     assert len(parts) > 1
     for cell in (cell for row in (HEADER, *ROWS) for cell in row[1:]):
         assert shown.count(cell) == 1
-
-
-def test_a_column_wider_than_the_width_stands_alone_beside_the_first():
-    assert [len(part.splitlines()) for part in table(HEADER, ROWS, 5).split("\n\n")] == [3] * 3
 
 
 def test_facts_are_wrapped_below_themselves():

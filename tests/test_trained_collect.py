@@ -183,8 +183,8 @@ def test_a_policy_s_file_works_wherever_a_policy_is_named(runs, tmp_path):
         ({"format_version": 1}, "has version 1 of the jbrep policy format"),
         ({"format": "jbrep encoder"}, "not a jbrep policy file"),
         ({"settings": {}}, r"settings\.\w+ is missing"),
-        ({"step": -1}, "step is -1: it must be a whole number"),
-        ({"run": "\x1b[2J"}, "run is .*: it must be a line"),
+        ({"step": -1}, "step is -1"),
+        ({"run": "\x1b[2J"}, "run is .*"),
         ({"encoder": {}}, "not a jbrep encoder file"),
     ],
 )

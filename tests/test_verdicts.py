@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import jbrep
+from jbrep.report.words import conclusion, told, verdict_cells
 from made_up import SEEDS, STUDY, make_runs, of_a_commit
 from small import adopt
 
@@ -16,7 +17,6 @@ from jbrep.records.record import to_plain
 from jbrep.report import report
 from jbrep.report.report import write_report
 from jbrep.report.tables import read_tables
-from jbrep.report.words import conclusion, told, verdict_cells
 from jbrep.stats.bootstrap import Interval
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan
@@ -170,7 +170,7 @@ def test_rules_that_do_not_fit_the_study(changes, field):
 
 
 def test_a_dry_run_tells_what_could_be_found(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.study.packing.estimate", lambda runs: 60)
+    monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
     (tmp_path / "it.toml").write_text(STUDY.toml())
     told = jbrep("study", tmp_path / "it.toml", "--dry-run", "--out", tmp_path / "out")
     assert told.exit_code == 0, told.output

@@ -41,7 +41,7 @@ def test_states_become_encoders_and_diagnostics(peace):
         assert label in told.output
     assert (folder / "judged" / "error_by_latent.png").exists()
     judged = json.loads((folder / "judged" / "evaluation.json").read_text())
-    assert judged["data"]["fingerprint"] == Dataset(data).manifest.fingerprint
+    assert judged["data"]["fingerprint"] == Dataset(data).fingerprint
     for encoder in map(load, paths):
         found = judged["encoders"][encoder.name]
         assert found["sha256"] == encoder.fingerprint

@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jbrep.report.figures.plot import Drawing
+from jbrep.report.figures.style import PAGE, PAPER, reference, styles
+from jbrep.report.words import shown
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jbrep.errors import InputError
 from jbrep.records.storage import write_whole
-from jbrep.report.figures.plot import Drawing
-from jbrep.report.figures.style import PAGE, PAPER, reference, styles
 from jbrep.report.tables import read_tables
-from jbrep.report.words import shown
 from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, SUPPORTED
 from jbrep.stats.labels import RepresentationResult

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from jbrep.records.lock import exclusive
 from jbrep.study import Plan, read_study
-from jbrep.study.packing import usual_workers
 from jbrep.study.prepare import check, prepare
+from jbrep.study.runner import usual_workers
 
 
 def main(file: Path, folder: Path) -> None:

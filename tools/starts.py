@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
+from jbrep.report.words import shown
 from joblib import cpu_count
 
 from jbrep.play.sources import find_player
 from jbrep.progress import Progress
-from jbrep.report.words import shown
 from jbrep.rl.files import RunRecord, read_run, runs_below
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within, share_of_gain
 from jbrep.stats.scale import best_blind

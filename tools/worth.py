@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jbrep.report.serving import good_codes, recommended
 
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.table import headline
 from jbrep.records.document import read_document
-from jbrep.report.serving import good_codes, recommended
 from jbrep.report.tables import Tables, read_tables
 from jbrep.stats.association import correlation_of_ranks, over_families
 from jbrep.stats.bootstrap import Array, Interval

@@ -15,8 +15,7 @@ import numpy as np
 from record import record
 
 import jbrep
-from jbrep.dataset import Dataset, Layout
-from jbrep.dataset.card import card
+from jbrep.dataset import Layout, from_file
 from jbrep.play.exported import exported_player
 from jbrep.play.sources import find_player
 from jbrep.rl.controller import load_policy
@@ -49,8 +48,8 @@ print((OUT / "walk.csv").read_text()[:300])
 
 # %%
 layout = Layout(observations=task.feature_names, time="time", episode="trial")
-data = Dataset.from_file(OUT / "data", OUT / "walk.csv", layout=layout, task=task)
-print(card(data))
+data = from_file(OUT / "data", OUT / "walk.csv", layout=layout, task=task)
+print(data.card())
 
 # %%
 for number in range(3):

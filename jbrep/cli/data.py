@@ -75,10 +75,10 @@ def collect(out: Path, **options: Any) -> None:
 def _report(out: Path, write: Callable[[], object]) -> None:
     """Let a data set be written; print what the folder holds then, and how fast it was written."""
     from jbrep.dataset import Dataset
-    from jbrep.dataset.manifest import MANIFEST, current_manifest
+    from jbrep.dataset.manifest import MANIFEST, read_manifest
     from jbrep.records.storage import exists
 
-    before = current_manifest(out).rows if exists(out / MANIFEST) else 0
+    before = read_manifest(out).rows if exists(out / MANIFEST) else 0
     began = time.monotonic()
     with stoppable(RESUMES):
         write()
@@ -100,7 +100,7 @@ def _tell_missing(dataset: "Dataset") -> None:
 
 def _report_size(out: Path, manifest: Any) -> None:
     """Print what the folder holds."""
-    size = sum(entry.bytes for entry in manifest.shards) / 1e6
+    size = manifest.bytes / 1e6
     episodes = counted(manifest.episodes, "episode")
     what = f"{episodes} of {manifest.task.name}, {manifest.rows:,} rows"
     say(f"{what}, {size:,.1f} MB in {out}")
@@ -117,12 +117,11 @@ def data() -> None:
 def info(data: Path, as_json: bool) -> None:
     """Show what a data set holds."""
     from jbrep.dataset import Dataset
-    from jbrep.dataset.card import card, describe
 
     if as_json:
-        echo_json(describe(Dataset(data)))
+        echo_json(Dataset(data).describe())
         return
-    echo_text(card(Dataset(data), terminal_width()))
+    echo_text(Dataset(data).card(terminal_width()))
 
 
 @data.command(epilog="Example: jbrep data verify data/face --replay 50")
@@ -132,7 +131,7 @@ def info(data: Path, as_json: bool) -> None:
 @threads_option
 @click.pass_context
 def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> None:
-    """Check every hash, shape, number and range.
+    """Check the hash of every shard, and the ranges of what is in them.
 
     Prints a line for each problem; the exit code is 1 if there are any.
     """
@@ -168,7 +167,7 @@ def _say_all(lines: Iterable[str]) -> bool:
 @_lanes
 @threads_option
 def repair(data: Path, lanes: int, threads: int | None) -> None:
-    """Restore damaged and missing files as they were."""
+    """Make damaged and missing shards again from their seeds."""
     from jbrep.collect.repair import repair as run
     from jbrep.play.sources import kept_policy
 

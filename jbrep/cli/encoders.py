@@ -287,12 +287,12 @@ def import_model(
 ) -> None:
     """Make an encoder file from an ONNX model.
 
-    MODEL takes observations in physical units, (rows, features), and is a chain of dense layers
-    with the usual activations and normalisations. Nothing in it is run.
+    MODEL takes observations in physical units, (rows, features), and gives codes. It may be any
+    graph; onnxruntime runs it.
     """
     from jbrep.encoders.card import card
     from jbrep.encoders.file import SUFFIX, save_new
-    from jbrep.encoders.from_onnx import convert
+    from jbrep.encoders.imported import convert
     from jbrep.records.storage import exists, taken
 
     task = needed_task(options)

@@ -154,7 +154,7 @@ def env(as_json: bool, **options: Any) -> None:
     --import MODULE, or MODULE:ID, which imports it. The environment is made and played for some
     steps; that it terminates is only known where it did.
     """
-    from jbrep.envs.card import card
+    from jbrep.envs.description import card
 
     task = needed_task(options)
     if as_json:

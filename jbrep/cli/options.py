@@ -8,8 +8,7 @@ from msgspec import NODEFAULT, inspect
 
 from jbrep.cli.base import COUNT, with_options
 from jbrep.records.keys import Key, keys_of, option_name
-from jbrep.records.record import Record, converted, from_text
-from jbrep.records.words import bare
+from jbrep.records.record import Record, bare, converted, from_text
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 _TYPES: dict[type[inspect.Type], click.ParamType[Any]] = {

@@ -174,10 +174,10 @@ def _perturb(
 ) -> None:
     """Show the rows of a table as they are finished, and write those so far."""
     from jbrep.play.perturbed import HEADER, Table, domains_of, perturb
-    from jbrep.records.storage import check_writable
+    from jbrep.records.storage import make_folder
 
     if out:
-        check_writable(out.parent)
+        make_folder(out.parent)
     domains, lacking = domains_of(player.task, chosen)
     if lacking and not chosen:
         told = f"{player.task.name} has no {', '.join(lacking)} that could be changed"

@@ -212,7 +212,7 @@ def tune(out: Path, trials: int, seeds: int, **options: Any) -> None:
 @contextmanager
 def _told_when_stopped(received: list[int], more: str) -> Iterator[None]:
     """End the command once a signal has stopped what it trains, as a shell reports it."""
-    from jbrep.rl.checkpoint import StoppedError  # imports torch
+    from jbrep.rl import StoppedError  # imports torch
 
     try:
         yield

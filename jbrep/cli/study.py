@@ -9,10 +9,13 @@ from jbrep.cli.base import PATH, RESUMES, as_json
 from jbrep.cli.environment import import_option
 from jbrep.cli.output import echo_json, echo_paths, echo_text, say, tell
 from jbrep.cli.signals import stoppable
-from jbrep.text import terminal_width
+from jbrep.text import Table, duration, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.report.report import Report
+    from jbrep.report.views import Cells
+    from jbrep.stats.rules import Planned
+    from jbrep.study.forecast import Forecast
 
 _COUNT = click.IntRange(1, 1024)
 
@@ -24,11 +27,6 @@ _COUNT = click.IntRange(1, 1024)
     "--workers",
     type=_COUNT,
     help="Processes at a time.  [default: one for each core; one if it learns on a GPU]",
-)
-@click.option(
-    "--width",
-    type=_COUNT,
-    help="The most agents that learn together in a process.  [default: what keeps all busy]",
 )
 @click.option(
     "--backend",
@@ -51,7 +49,6 @@ def study(
     study: Path,
     out: Path | None,
     workers: int | None,
-    width: int | None,
     backend: str,
     dry_run: bool,
     register: bool,
@@ -69,8 +66,8 @@ def study(
 
     if dry_run and register:
         raise InputError("--dry-run and --register exclude each other: choose one")
-    if register and (workers or width or backend != "local"):
-        raise InputError("--register runs nothing: leave out --workers, --width and --backend")
+    if register and (workers or backend != "local"):
+        raise InputError("--register runs nothing: leave out --workers and --backend")
     if not exists(study):
         raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)
@@ -81,38 +78,74 @@ def study(
         raise InputError("--dry-run forecasts this machine alone: leave out --backend")
     folder = out or Path("runs") / study.stem
     if dry_run or register:
-        _announce(study, folder, dry_run, workers, width)
+        _announce(study, folder, dry_run, workers)
         return
     from jbrep import api
 
     with stoppable(RESUMES):
-        made = api.study(study, folder, workers=workers, width=width, backend=backend)
+        made = api.study(study, folder, workers=workers, backend=backend)
     _show(made)
     context.exit(bool(made.tables.record.missing))
 
 
-def _announce(
-    path: Path, folder: Path, dry_run: bool, workers: int | None, width: int | None
-) -> None:
+def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> None:
     """Say what a study is going to do, or write it down before the first run."""
-    from jbrep.records.document import read_document
-    from jbrep.report.statistics import forecast_text
     from jbrep.study import Plan, read_study, register_study
-    from jbrep.study.packing import forecast
-    from jbrep.study.registration import Registration
+    from jbrep.study.forecast import forecast
+    from jbrep.study.registration import registration_in
 
     plan = Plan(read_study(path), folder, path)
-    expected = forecast(plan, workers, width) if dry_run else None
+    expected = forecast(plan, workers) if dry_run else None
     for notice in plan.study.notices:
         tell(notice, err=True)
     if expected:
-        return click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
+        return click.echo(_forecast_text(expected, plan.study.planned, terminal_width()))
     registered = register_study(plan)
-    found = read_document(registered, Registration)
+    found = registration_in(registered)
     click.echo(f"registered on {found.date} (SHA-256 {found.sha256})")
     if plan.in_git:
         tell(f"Commit {registered.name}, then run the study: before, it is refused.", err=True)
     return echo_paths([registered])
+
+
+def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
+    """The runs to go, how long they would take, and what could be found of its claims."""
+    from jbrep.report.views import in_text, probability, say
+    from jbrep.stats.power import BETTER_BY, EARLIER_BY, SDS
+
+    to_go: dict[str, list[float]] = {}
+    for cell, seconds in forecast.runs:
+        to_go.setdefault(cell.label, []).append(seconds)
+    runs: Cells = {
+        "agents": lambda item: item[0],
+        "runs": lambda item: str(len(item[1])),
+        "time of each": lambda item: duration(max(item[1])),
+    }
+    made_first: Cells = {
+        "made first": lambda cost: cost.what,
+        "to go": lambda cost: str(cost.to_go),
+        "done": lambda cost: str(cost.done),
+        "time on one core": lambda cost: duration(cost.seconds),
+    }
+    prospects: Cells = {
+        "on": lambda each: each.where,
+        "claim": lambda each: str(each.claim),
+        "units": lambda each: str(each.units),
+        "level": lambda each: probability(each.level),
+        "least p": lambda each: probability(each.least_p),
+        "power": lambda each: ", ".join(f"{100 * power:.0f} %" for power in each.power),
+        "unseen": lambda each: f"{100 * each.unseen:.0f} %",
+    }
+    parts: list[str | Table] = [Table.of("", to_go.items(), runs)] if to_go else []
+    on_one_core = sum(seconds for _, seconds in forecast.runs)
+    parts.append(say("forecast", forecast, duration(on_one_core), duration(forecast.elapsed)))
+    parts += [Table.of("", forecast.made_first, made_first)] if forecast.made_first else []
+    if forecast.prospects:
+        count = len(planned.rules.chains) * len(planned.groups)
+        parts.append(Table.of("", forecast.prospects, prospects))
+        parts.append(say("rules", count, planned.rules.error, len(planned.seeds)))
+        parts.append(say("power", SDS, BETTER_BY, EARLIER_BY))
+    return "\n\n".join(in_text(part, width) for part in parts)
 
 
 @click.command(epilog="Example: jbrep report runs/demo")
@@ -124,9 +157,6 @@ def _announce(
     help="From jbrep evaluate, of encoders of these runs: its diagnostics go into the tables. "
     "{task} in it stands for each task. May be repeated.",
 )
-@click.option(
-    "--across-trainers", is_flag=True, help="Compare runs of different trainers or precisions, too."
-)
 @click.option("--out", type=PATH, help="A folder for it.  [default: the study's own]")
 @click.option("--all", "everything", is_flag=True, help="Print every table; the page has them.")
 @import_option
@@ -134,7 +164,6 @@ def _announce(
 def report(
     folder: Path,
     evaluation: tuple[str, ...],
-    across_trainers: bool,
     out: Path | None,
     everything: bool,
     as_json: bool,
@@ -146,22 +175,19 @@ def report(
     """
     from jbrep import api
 
-    made = api.report(folder, evaluation=evaluation, across_trainers=across_trainers, out=out)
+    made = api.report(folder, evaluation=evaluation, out=out)
     _show(made, everything, as_json)
 
 
 def _show(made: "Report", everything: bool = False, as_json: bool = False) -> None:
-    import json
-
-    from jbrep.report.report import SUMMARY
-    from jbrep.report.statistics import results_text
+    from jbrep.report.report import results_text
 
     if not as_json:
-        echo_text(results_text(made.tables, terminal_width(), everything))
+        echo_text(results_text(made.findings, terminal_width(), everything))
     for line in made.notes:
         say(line, err=True)
     if as_json:
-        return echo_json(json.loads((made.folder / SUMMARY).read_bytes()))
+        return echo_json(made.findings.as_json())
     beside = ", ".join(path.name for path in made.paths if path != made.page)
     more = "" if everything else " --all prints every table."
     click.echo()

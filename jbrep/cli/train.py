@@ -17,7 +17,7 @@ from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError, choose
 from jbrep.methods.kinds import KINDS
 from jbrep.records.keys import Key, keys_of, option_name
-from jbrep.records.words import bare
+from jbrep.records.record import bare
 
 if TYPE_CHECKING:
     from jbrep.training.method import Method

@@ -3,14 +3,14 @@
 import math
 import pickle
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from jbrep.collect.shards import Made, Produce, Remaining, Simulator, all_of
+from jbrep.collect.shards import Growth, Made, Produce, Simulator, all_of
 from jbrep.dataset.schema import Columns
 from jbrep.envs.instances import close_kept
 from jbrep.envs.make import is_batched
@@ -44,38 +44,45 @@ def _can_be_sent(*parts: Any) -> bool:
         return False
 
 
-def _pieces(simulator: Simulator, first: int, remaining: Remaining) -> Iterator[range]:
-    """The episodes that are missing from a shard on, some of one shard at a time."""
-    each = simulator.settings.shard_episodes
-    size = math.ceil(each / _PIECES)
-    begin = first * each + remaining.begun(first)
-    while True:
-        end = min(begin + size, (begin // each + 1) * each)
-        yield range(begin, end)
-        begin = end
+class _Ahead:
+    """The pieces of a data set that are made side by side: of a shard each, in order.
+
+    Attributes:
+        waiting: those that were begun and aren't given yet, or what stands for them.
+    """
+
+    def __init__(self, growth: Growth):
+        self.waiting = deque[Any]()
+        self._growth, self._begin = growth, growth.episodes
+        self._each = growth.manifest.settings.shard_episodes
+
+    def next(self, most: int) -> range | None:
+        """The episodes to begin beside those that wait, most of them at a time; None if none."""
+        if self.waiting and (len(self.waiting) >= most or not self._growth.wants(self._begin)):
+            return None
+        begin, end = self._begin, (self._begin // self._each + 1) * self._each
+        self._begin = min(begin + math.ceil(self._each / _PIECES), end)
+        return range(begin, self._begin)
 
 
 def _in_processes(simulator: Simulator, workers: int) -> Produce:
     """Pieces made side by side, given in order; one whose worker is killed is made again."""
-    most = _AHEAD * workers
 
-    def produce(first: int, remaining: Remaining, tick: Tick) -> Iterator[Columns]:
-        if not remaining.wants((first + 1) * simulator.settings.shard_episodes):  # one shard alone
-            yield from simulator.in_turn(first, remaining, tick)
+    def produce(growth: Growth, tick: Tick) -> Iterator[Columns]:
+        each = simulator.settings.shard_episodes
+        if not growth.wants((growth.episodes // each + 1) * each):  # one shard alone
+            yield from simulator.in_turn(growth, tick)
             return
-        pieces = _pieces(simulator, first, remaining)
-        coming, waiting = next(pieces), deque[range]()
-        made, attempts = dict[range, Made](), Counter[range]()
+        ahead, made, attempts = _Ahead(growth), dict[range, Made](), Counter[range]()
         known = imported_modules(), spec_of(simulator.settings.task)
         close_kept()  # the workers have their own
         with Pool[range, Made](make_episodes, workers, lambda: None) as pool:
             while True:
-                while not pool.is_full and _is_next(coming, waiting, most, remaining):
+                while not pool.is_full and (coming := ahead.next(_AHEAD * workers)):
                     pool.submit(coming, known, simulator, coming)
-                    waiting.append(coming)
-                    coming = next(pieces)
-                if waiting[0] in made:
-                    yield from all_of(made.pop(waiting.popleft()))
+                    ahead.waiting.append(coming)
+                if ahead.waiting[0] in made:
+                    yield from all_of(made.pop(ahead.waiting.popleft()))
                     continue
                 piece, result = pool.result()
                 if result is not None:
@@ -90,11 +97,6 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
                 pool.submit(piece, known, simulator, piece)
 
     return produce
-
-
-def _is_next(coming: range, waiting: Sequence[Any], most: int, remaining: Remaining) -> bool:
-    """Whether a piece is to be begun beside those that aren't given yet."""
-    return not waiting or (len(waiting) < most and remaining.wants(coming.start))
 
 
 def make_episodes(
@@ -128,28 +130,26 @@ def on_ray(simulator: Simulator) -> Produce:
     again on another.
     """
 
-    def produce(first: int, remaining: Remaining, tick: Tick) -> Iterator[Columns]:
+    def produce(growth: Growth, tick: Tick) -> Iterator[Columns]:
         import ray
 
         make = on_cluster(make_episodes, simulator.num_threads)
         alone = replace(simulator, lanes=1, num_threads=1)
         known = imported_modules(), spec_of(simulator.settings.task)
-        pieces = _pieces(simulator, first, remaining)
-        coming, waiting = next(pieces), deque[Any]()
+        ahead = _Ahead(growth)
         try:
             while True:
                 most = _AHEAD * int(ray.cluster_resources().get("CPU", 1))
-                while _is_next(coming, waiting, most, remaining):
-                    waiting.append(make.remote(known, alone, coming))
-                    coming = next(pieces)
-                made = ray.get(waiting[0])
-                waiting.popleft()
+                while coming := ahead.next(most):
+                    ahead.waiting.append(make.remote(known, alone, coming))
+                made = ray.get(ahead.waiting[0])
+                ahead.waiting.popleft()
                 yield from all_of(made)
         except ray.exceptions.RayError as error:
             reason = first_line(error)
             raise InputError(f"the cluster could not make episodes: {reason}") from error
         finally:
-            for job in waiting:
+            for job in ahead.waiting:
                 ray.cancel(job, force=True)
 
     return produce

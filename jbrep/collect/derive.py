@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from jbrep.collect.collector import write_shards
 from jbrep.collect.policies import acts_on_observations
 from jbrep.collect.replay import replay_problems
-from jbrep.collect.shards import Produce, Remaining
+from jbrep.collect.shards import Growth, Produce
 from jbrep.dataset import Dataset, DataSettings
-from jbrep.dataset.manifest import Manifest, new_manifest, open_shard
+from jbrep.dataset.manifest import Entry, Manifest, new_manifest, open_shard, shard_image
 from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns, some_episodes
-from jbrep.dataset.shard import column_hashes
 from jbrep.dataset.verify import policy_files
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.recording import Tick
@@ -130,19 +129,19 @@ def derive_view(
 def _check_derived(
     folder: Path, wanted: Manifest, dataset: Dataset, change: Callable[[Columns], Columns]
 ) -> None:
-    """Check that what a folder holds was derived from these data, by the hashes of its columns.
+    """Check that the shards of a folder are what comes of these data.
 
     Settings alone don't say so: they are the same of a log that was imported once more.
     """
     source, known = dataset.folder, dataset.manifest
 
-    def hashes(shard: int, episodes: int) -> dict[str, str]:
+    def made(shard: int, episodes: int) -> Entry:
         columns = change(open_shard(source, known, shard))
-        return column_hashes(some_episodes(columns, 0, episodes))
+        return shard_image(wanted, shard, some_episodes(columns, 0, episodes))[0]
 
     entries = enumerate(wanted.shards)
     is_same = len(wanted.shards) <= len(known.shards) and all(
-        hashes(shard, entry.episodes) == entry.sha256 for shard, entry in entries
+        made(shard, entry.episodes) == entry for shard, entry in entries
     )
     if not is_same:
         raise InputError(
@@ -203,10 +202,12 @@ def _check_replay(dataset: Dataset, settings: DataSettings, num_threads: int | N
 def _each_shard(dataset: Dataset, change: Callable[[Columns], Columns]) -> Produce:
     """Makes the shards of a data set from those of another."""
 
-    def produce(first: int, remaining: Remaining, tick: Tick) -> Iterator[Columns]:
-        manifest = dataset.manifest
-        for shard in range(first, len(manifest.shards)):
-            yield change(open_shard(dataset.folder, manifest, shard))
+    def produce(growth: Growth, tick: Tick) -> Iterator[Columns]:
+        manifest, each = dataset.manifest, dataset.manifest.settings.shard_episodes
+        for shard in range(growth.episodes // each, len(manifest.shards)):
+            columns = change(open_shard(dataset.folder, manifest, shard))
+            known = growth.episodes - shard * each
+            yield some_episodes(columns, known, manifest.shards[shard].episodes)
 
     return produce
 

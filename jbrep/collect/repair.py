@@ -1,34 +1,19 @@
-"""Repairing a data set: damaged or missing files are restored as they were."""
+"""Repairing a data set: damaged or missing shards are made again as they were."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 from jbrep.collect.policies import Policy, make_policy
 from jbrep.collect.shards import LANES, Simulator
-from jbrep.dataset.manifest import (
-    BACKUP,
-    MANIFEST,
-    Entry,
-    Manifest,
-    current_manifest,
-    hdf5_files,
-    open_shard,
-    read_manifest,
-    shard_name,
-    unlisted_files,
-    write_manifest,
-    write_shard,
-)
-from jbrep.dataset.shard import column_hashes
+from jbrep.dataset.manifest import Manifest, open_shard, read_manifest, shard_image, shard_path
+from jbrep.dataset.schema import DataSettings
 from jbrep.dataset.verify import policy_files
 from jbrep.envs.lanes import check_counts
-from jbrep.envs.origin import changes_of
 from jbrep.errors import DamageError, InputError
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
+from jbrep.records.storage import write_whole
 
 
 def repair(
@@ -37,10 +22,7 @@ def repair(
     num_threads: int | None = None,
     make: Callable[[Mapping[str, Any]], Policy] = make_policy,
 ) -> Iterator[str]:
-    """Simulate damaged and missing shards again, and restore the manifest from its backup.
-
-    A damaged backup is restored from the manifest. A file that isn't part of the data set is
-    renamed, never deleted.
+    """Make damaged and missing shards again from their seeds.
 
     Args:
         folder: of the data set.
@@ -49,103 +31,55 @@ def repair(
         make: makes the policy from what the manifest says of it.
 
     Yields:
-        A line for each file restored or renamed.
+        A line for each shard that is restored.
     """
     check_counts(lanes, num_threads)
-    intact = _intact_manifest(folder)
     with exclusive(folder):
-        manifest = current_manifest(folder) if intact == MANIFEST else read_manifest(folder, intact)
-        for path in unlisted_files(manifest, hdf5_files(folder)):
-            aside = _set_aside(path)
-            yield f"{path} renamed to {aside.name}: it is not one of the data set's shards"
+        manifest = read_manifest(folder)
+        settings = manifest.settings
         for shard in range(len(manifest.shards)):
-            if _is_intact(folder, manifest, shard):
-                continue
-            entry = _restore(folder, manifest, shard, lanes, num_threads, make)
-            shards = (*manifest.shards[:shard], entry, *manifest.shards[shard + 1 :])
-            manifest = manifest.replace(shards=shards)
-            yield f"{folder / shard_name(shard)} restored"
-        if not _is_backed_up(folder, manifest):
-            write_manifest(folder, manifest)
-            yield f"{folder / MANIFEST} and its backup restored"
+            try:
+                open_shard(folder, manifest, shard)
+            except DamageError:
+                path = shard_path(folder, shard)
+                if reason := _why_not(settings):
+                    raise InputError(f"{path} can't be restored: {reason}") from None
+                simulator = Simulator(settings, make(settings.policy), lanes, num_threads)
+                write_whole(path, _image(simulator, manifest, shard, path))
+                yield f"{path} restored"
         policy_files(folder, manifest)
 
 
-def _intact_manifest(folder: Path) -> str:
-    """The name of the manifest, or of its backup if the manifest is damaged.
-
-    Raises:
-        DamageError: both are damaged.
-    """
-    for name in (MANIFEST, BACKUP):
-        with suppress(DamageError):
-            read_manifest(folder, name)
-            return name
-    raise DamageError(
-        f"{folder} can't be repaired: {MANIFEST} and {BACKUP} are both damaged or missing; collect "
-        "again in another folder"
-    )
-
-
-def _is_backed_up(folder: Path, manifest: Manifest) -> bool:
-    try:
-        return read_manifest(folder) == read_manifest(folder, BACKUP) == manifest
-    except InputError:
-        return False
-
-
-def _set_aside(path: Path) -> Path:
-    """Rename a file to an unused name."""
-    names = (f"{path.name}.unlisted{number or ''}" for number in count())
-    aside = next(path.with_name(name) for name in names if not path.with_name(name).exists())
-    return path.rename(aside)
-
-
-def _is_intact(folder: Path, manifest: Manifest, shard: int) -> bool:
-    try:
-        dict(open_shard(folder, manifest, shard))
-    except DamageError:
-        return False
-    return True
-
-
-def _restore(
-    folder: Path,
-    manifest: Manifest,
-    shard: int,
-    lanes: int,
-    num_threads: int | None,
-    make: Callable[[Mapping[str, Any]], Policy],
-) -> Entry:
-    settings, entry, path = manifest.settings, manifest.shards[shard], folder / shard_name(shard)
+def _why_not(settings: DataSettings) -> str:
+    """Why no episode of a data set can be simulated again; empty if it can be."""
     if settings.is_imported:
-        raise InputError(
-            f"{path} can't be restored: the data set was imported; import its source, "
-            f"{settings.policy['source']}, again in another folder"
-        )
+        source = settings.policy["source"]
+        return f"the data set was imported; import its source, {source}, again in another folder"
     if settings.reward:
-        raise InputError(
-            f"{path} can't be restored: {settings.reward} gave the rewards; derive the data set "
-            "again in another folder"
-        )
+        gave = f"{settings.reward} gave the rewards"
+        return f"{gave}; derive the data set again in another folder"
     if not settings.task.reproducible:
-        raise InputError(
-            f"{path} can't be restored: {settings.task.name} is not reproducible, the same seed "
-            "and actions lead to other states; collect again in another folder"
+        return (
+            f"{settings.task.name} is not reproducible, the same seed and actions lead to other "
+            "states; collect again in another folder"
         )
+    return ""
+
+
+def _image(simulator: Simulator, manifest: Manifest, shard: int, path: Path) -> bytes:
+    """The bytes of a shard, simulated again."""
+    entry, task = manifest.shards[shard], manifest.task
+    first = shard * manifest.settings.shard_episodes
     with Progress(total=entry.rows, unit="step", unit_scale=True, desc=path.name) as progress:
-        simulator = Simulator(settings, make(settings.policy), lanes, num_threads)
         try:
-            columns = simulator.shard(shard, progress.update, most_episodes=entry.episodes)
+            episodes = range(first, first + entry.episodes)
+            made, image = shard_image(manifest, shard, simulator.columns(episodes, progress.update))
         except InputError as error:
-            again = "; derive the data set again in another folder" if settings.task.view else ""
+            again = "; derive the data set again in another folder" if task.view else ""
             raise InputError(f"{path} can't be restored: {error}{again}") from None
-    if column_hashes(columns) != entry.sha256:
-        changed = changes_of(settings.task)
-        why = (
-            f"{changed} changed since; put that back"
-            if changed
-            else (f"use the machine it was made on, and these versions: {dict(manifest.versions)}")
+    if made != entry:
+        raise InputError(
+            f"{path} can't be restored here: it comes out differently; use the robot as it was, on "
+            f"the machine it was made on, with these versions: {dict(manifest.versions)}"
         )
-        raise InputError(f"{path} can't be restored here: it comes out differently; {why}")
-    return write_shard(folder, manifest, shard, columns)
+    return image

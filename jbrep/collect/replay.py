@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from jbrep.dataset import Dataset, Episode
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
-from jbrep.envs.origin import changes_of
 from jbrep.envs.recording import Read, Recording, Tick, open_loop, read_nothing, read_states, record
 from jbrep.errors import InputError
 from jbrep.progress import Progress
@@ -57,15 +56,10 @@ def replay_problems(
             recording = simulate_again(some, read, bar.update, num_threads)
             for lane, episode in enumerate(some):
                 if not _is_equal(recording, lane, episode):
-                    versions = dict(dataset.manifest.versions)
-                    changed = changes_of(dataset.task)
-                    why = (
-                        f"{changed} changed since"
-                        if changed
-                        else (f"another machine, or other versions than {versions}?")
-                    )
                     yield (
-                        f"{dataset.folder}: episode {episode.number} simulated again differs: {why}"
+                        f"{dataset.folder}: episode {episode.number} simulated again differs: has "
+                        "the robot changed, or is this another machine, or other versions than "
+                        f"{dict(dataset.manifest.versions)}?"
                     )
 
 

@@ -3,15 +3,15 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import count
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.collect.policies import Policy
-from jbrep.dataset.manifest import Manifest
-from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
+from jbrep.dataset.manifest import Manifest, commit, open_shard
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined, some_episodes
 from jbrep.envs.lanes import EnvironmentFailedError, Lanes, Retries
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Recording, Tick, read_nothing, read_states, record
@@ -19,46 +19,66 @@ from jbrep.errors import InputError
 
 LANES = 100  # of a batch
 SHARD_ROWS = 20_000  # of a shard of the usual size, unless a batch makes it
+_LENGTH = EPISODES + "length"
 
 Array = NDArray[Any]
 
 
-@dataclass
-class Remaining:
-    """What the shards of a manifest still lack.
+class Growth:
+    """A data set that lacks episodes: whole shards are written as soon as they are made.
+
+    Args:
+        folder: of the data set.
+        manifest: of what is there, with as many steps as are wanted.
 
     Attributes:
-        manifest: of what is committed.
-        held: rows that were made since.
+        manifest: of the full shards that are there.
     """
 
-    manifest: Manifest
-    held: int = 0
+    def __init__(self, folder: Path, manifest: Manifest):
+        self._folder = folder
+        self._each = manifest.settings.shard_episodes
+        full = manifest.episodes // self._each
+        begun = range(full, len(manifest.shards))  # the last one, if it isn't full
+        self._held = [open_shard(folder, manifest, shard) for shard in begun]
+        self.manifest = manifest.replace(shards=manifest.shards[:full])
 
     @property
     def rows(self) -> int:
-        """How many rows, at present."""
-        return self.manifest.settings.steps - self.manifest.rows - self.held
+        """How many there are, written or not."""
+        return self.manifest.rows + sum(len(each["step"]) for each in self._held)
 
-    def begun(self, shard: int) -> int:
-        """How many episodes of a shard are committed."""
-        each = self.manifest.settings.shard_episodes
-        return min(max(self.manifest.episodes - shard * each, 0), each)
+    @property
+    def episodes(self) -> int:
+        """How many there are, written or not."""
+        return self.manifest.episodes + sum(len(each[_LENGTH]) for each in self._held)
+
+    @property
+    def lacking(self) -> int:
+        """How many rows are still to be made."""
+        return self.manifest.settings.steps - self.rows
 
     def wants(self, episode: int) -> bool:
         """Whether an episode of that number is likely to be needed.
 
-        Judging by the mean of those that are committed, or else by the usual size of a shard.
+        Judging by the mean of those that are there, or else by the usual size of a shard.
         """
-        manifest, settings = self.manifest, self.manifest.settings
-        usual = min(settings.task.max_episode_steps, SHARD_ROWS / settings.shard_episodes)
-        mean = manifest.rows / manifest.episodes if manifest.episodes else usual
-        return (episode - manifest.episodes) * mean < settings.steps - manifest.rows
+        longest = self.manifest.task.max_episode_steps
+        usual = min(longest, SHARD_ROWS / self._each)
+        mean = self.rows / self.episodes if self.episodes else usual
+        return (episode - self.episodes) * mean < self.lacking
+
+    def add(self, columns: Columns) -> None:
+        """Take the next episodes, of one shard, as far as they are needed."""
+        needed = int(np.searchsorted(np.cumsum(columns[_LENGTH]), self.lacking)) + 1
+        self._held.append(some_episodes(columns, 0, needed))
+        if self.episodes % self._each == 0 or self.lacking <= 0:
+            self.manifest = commit(self._folder, self.manifest, joined(self._held))
+            self._held = []
 
 
-# the columns of episodes in order, from the shard of a number on, some of one shard at a time;
-# episodes that are committed already may be left out
-Produce = Callable[[int, Remaining, Tick], Iterator[Columns]]
+# the columns of the next episodes that a data set lacks, some of one shard at a time
+Produce = Callable[[Growth, Tick], Iterator[Columns]]
 
 
 class Made(NamedTuple):
@@ -94,15 +114,13 @@ class Simulator:
     num_threads: int | None = None
     retries: int = 0
 
-    def in_turn(self, first: int, remaining: Remaining, tick: Tick) -> Iterator[Columns]:
+    def in_turn(self, growth: Growth, tick: Tick) -> Iterator[Columns]:
         """Make one shard after the other, each with all threads."""
-        for number in count(first):
-            episodes = self._episodes(number)[remaining.begun(number) :]
-            yield from self._blocks(episodes, tick, lambda: remaining.rows)
-
-    def _episodes(self, shard: int) -> Array:
         each = self.settings.shard_episodes
-        return np.arange(shard * each, (shard + 1) * each)
+        while True:
+            first = growth.episodes
+            episodes = np.arange(first, (first // each + 1) * each)
+            yield from self._blocks(episodes, tick, lambda: growth.lacking)
 
     def made(self, episodes: range, tick: Tick) -> Made:
         """Some episodes of a shard."""
@@ -114,16 +132,9 @@ class Simulator:
             failure = str(error)
         return Made(joined(blocks) if blocks else None, failure)
 
-    def shard(self, number: int, tick: Tick, most_episodes: int | None = None) -> Columns:
-        """The columns of a shard.
-
-        Args:
-            number: of the shard.
-            tick: called with the number of steps made.
-            most_episodes: how many of its episodes to make; None makes all.
-        """
-        episodes = self._episodes(number)[:most_episodes]
-        return joined(list(self._blocks(episodes, tick, lambda: math.inf)))
+    def columns(self, episodes: range, tick: Tick) -> Columns:
+        """The columns of some episodes of a shard."""
+        return joined(list(self._blocks(np.array(episodes), tick, lambda: math.inf)))
 
     def _blocks(
         self, episodes: Array, tick: Tick, wanted: Callable[[], float]

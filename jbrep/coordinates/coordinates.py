@@ -3,7 +3,7 @@
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cached_property
 from types import SimpleNamespace
@@ -52,22 +52,33 @@ class Part(Record, frozen=True, array_like=True):
         """Names of the numbers that it gives."""
         return tuple(f"{self.name}.{end}" if end else self.name for end in self._formula.gives)
 
-    @property
-    def solved(self) -> tuple[str, ...]:
-        """Names of the numbers that its inverse gives."""
-        return self.of[: self._formula.solves]
-
-    @property
-    def beside(self) -> tuple[str, ...]:
-        """Names of the numbers that its inverse needs besides those that it gives."""
-        return self.of[self._formula.solves :]
-
 
 class _Step(NamedTuple):
-    """A formula on the way back from coordinates to features."""
+    """A part's formula, or its inverse, which gives some of the numbers that the part is of."""
 
     part: Part
     is_inverse: bool
+
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """Names of the numbers that are needed."""
+        part, formula = self.part, FORMULAS[self.part.formula]
+        return part.gives + part.of[formula.solves :] if self.is_inverse else part.of
+
+    @property
+    def gives(self) -> tuple[str, ...]:
+        """Names of the numbers that follow."""
+        part, formula = self.part, FORMULAS[self.part.formula]
+        return part.of[: formula.solves] if self.is_inverse else part.gives
+
+    def calculate(self, library: Any, known: dict[str, Any]) -> None:
+        """Add columns to those that are known, by name."""
+        formula = FORMULAS[self.part.formula]
+        function = formula.inverse if self.is_inverse else formula.forward
+        assert function is not None  # else it would give nothing
+        made = function(library, [known[name] for name in self.takes], self.part.soft)
+        for name, column in zip(self.gives, made, strict=True):
+            known.setdefault(name, column)
 
 
 class Coordinates:
@@ -76,12 +87,9 @@ class Coordinates:
     Observations and coordinates are NumPy arrays or torch tensors, with the numbers along the last
     axis. None of the formulas jumps; of a body that stands on its head the heading is lost.
 
-    Args:
+    Attributes:
         task: whose observations they are calculated from.
         parts: in order; each takes features, or what earlier parts give.
-
-    Attributes:
-        task, parts: as given.
         names: of all coordinates, in order.
         sources: the part that each coordinate is of, by name.
     """
@@ -125,7 +133,7 @@ class Coordinates:
                 )
         known = {name: observation[..., i] for i, name in enumerate(self.task.feature_names)}
         for part in self.parts:
-            _calculate(library, _Step(part, False), known)
+            _Step(part, False).calculate(library, known)
         return library.stack([known[name] for name in self.names], -1)
 
     def _of_one(self, numbers: list[float]) -> list[float]:
@@ -160,7 +168,7 @@ class Coordinates:
             if isinstance(step, str):
                 known[step] = coordinates[..., 0] * 0
             else:
-                _calculate(library, step, known)
+                step.calculate(library, known)
         return library.stack([in_range(known[each.name], each) for each in self.task.features], -1)
 
     @cached_property
@@ -171,21 +179,17 @@ class Coordinates:
 
     def _steps_back(self) -> Iterator["_Step | str"]:
         """Steps that lead from coordinates to features; the name of a feature sets it to 0."""
-        known = set(self.names)
-        left = [
-            way
-            for part in self.parts
-            for way in (
-                _Way(_Step(part, True), {*part.gives, *part.beside}, part.solved),
-                _Way(_Step(part, False), {*part.of}, part.gives),
-            )
-        ]
-        yield from _allowed(known, left)
-        for name in self.task.feature_names:
-            if name not in known:
-                yield name
-                known.add(name)
-                yield from _allowed(known, left)
+        known = {*self.names}
+        steps = [_Step(part, is_inverse) for part in self.parts for is_inverse in (True, False)]
+        while missing := [name for name in self.task.feature_names if name not in known]:
+            before = len(known)
+            for step in steps:
+                if known.issuperset(step.takes) and not known.issuperset(step.gives):
+                    yield step
+                    known.update(step.gives)
+            if len(known) == before:
+                yield missing[0]
+                known.add(missing[0])
 
     @cached_property
     def features(self) -> tuple[Feature, ...]:
@@ -195,26 +199,6 @@ class Coordinates:
             of = [known[name] for name in part.of]
             known |= zip(part.gives, _described(part, of), strict=True)
         return tuple(known[name] for name in self.names)
-
-
-class _Way(NamedTuple):
-    """A step with the names that it needs and those that it gives."""
-
-    step: _Step
-    needs: set[str]
-    gives: Collection[str]
-
-
-def _allowed(known: set[str], left: list[_Way]) -> Iterator[_Step]:
-    """All steps that what is known allows; adds to that, and removes ways that give nothing new."""
-    before = None
-    while before != len(known):
-        before = len(known)
-        for way in left:
-            if way.needs <= known and not known.issuperset(way.gives):
-                yield way.step
-                known.update(way.gives)
-        left[:] = [way for way in left if not known.issuperset(way.gives)]
 
 
 def _described(part: Part, of: list[Feature]) -> list[Feature]:
@@ -239,18 +223,6 @@ def _described(part: Part, of: list[Feature]) -> list[Feature]:
             low = 0.0 if part.formula == "polar" else -most
             made.append(Feature(name=name, unit=unit, low=low, high=most))
     return made
-
-
-def _calculate(library: Any, step: _Step, known: dict[str, Any]) -> None:
-    part, formula = step.part, FORMULAS[step.part.formula]
-    takes, gives = (
-        (part.gives + part.beside, part.solved) if step.is_inverse else (part.of, part.gives)
-    )
-    columns: Columns = [known[name] for name in takes]
-    made = formula.inverse if step.is_inverse else formula.forward
-    assert made is not None  # else it would solve nothing
-    for name, column in zip(gives, made(library, columns, part.soft), strict=True):
-        known.setdefault(name, column)
 
 
 def in_range(values: Any, feature: Feature) -> Any:

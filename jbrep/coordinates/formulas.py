@@ -57,8 +57,8 @@ def _heading(library: Any, columns: Columns, soft: float) -> Columns:
     return [w * w - z * z, 2 * w * z]
 
 
-def _attitude(library: Any, columns: Columns, soft: float) -> Columns:
-    return _tilt(library, columns, soft) + _heading(library, columns, soft)
+def _attitude(*given: Any) -> Columns:
+    return _tilt(*given) + _heading(*given)
 
 
 def _quaternion(library: Any, columns: Columns, soft: float) -> Columns:

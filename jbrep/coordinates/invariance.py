@@ -10,9 +10,9 @@ from gymnasium.spaces.utils import flatten
 
 from jbrep.coordinates.coordinates import Coordinates
 from jbrep.coordinates.made import Ingredient, System, make_coordinates
-from jbrep.envs.make import action_in, aside, make_env, reason
-from jbrep.envs.mujoco import quarter_turn
+from jbrep.envs.make import action_in, aside, make_env
 from jbrep.envs.names import spec_of
+from jbrep.envs.physics import quarter_turn
 from jbrep.envs.task import Array, Task
 from jbrep.envs.view import Window
 from jbrep.errors import InputError, Notice, refusing
@@ -25,7 +25,7 @@ _SHIFT = (0.5, -0.25)  # [m]
 def tried_coordinates(
     task: Task, system: System, leave_out: Collection[Ingredient] = ()
 ) -> Coordinates | None:
-    """As `make_coordinates`, but symmetry is tried out."""
+    """What `make_coordinates` makes, once symmetry was tried out."""
     made = make_coordinates(task, system, leave_out)
     if made and system == "symmetry":
         check_invariant(made)
@@ -40,7 +40,7 @@ def check_invariant(coordinates: Coordinates) -> None:
     end alike, too. Where all rewards were the same, a notice says that they tell nothing.
     """
     task = coordinates.task
-    with refusing(f"symmetry can't be tried on {task.name}", told=reason), aside():
+    with refusing(f"symmetry can't be tried on {task.name}"), aside():
         steps = _tried(task)
     if not steps:
         raise InputError(
@@ -74,7 +74,6 @@ def _not_the_same(task: Task, what: str, as_it_is: float, turned: float) -> Inpu
 
 
 def _tried(task: Task) -> list[tuple[Array, Array]]:
-    """The steps of some episodes, see `_played`."""
     envs: list[gymnasium.Env[Any, Any]] = []
     try:
         for _ in range(2):
@@ -118,6 +117,5 @@ def _played(
 
 
 def _flat(envs: Sequence[gymnasium.Env[Any, Any]], given: Sequence[Any]) -> Array:
-    """What environments gave, (n, D)."""
     pairs = zip(envs, given, strict=True)
     return np.array([flatten(env.observation_space, each) for env, each in pairs], np.float64)

@@ -22,7 +22,7 @@ _Features = tuple[Feature, ...]
 def make_coordinates(
     task: Task, system: System, leave_out: Collection[Ingredient] = ()
 ) -> Coordinates | None:
-    """A task's coordinates, from the kinds of its features.
+    """A task's coordinates, from the kinds of its features; None for the observation itself.
 
     Args:
         task: says what its features are.
@@ -32,9 +32,6 @@ def make_coordinates(
         leave_out: of the last two: `angles` (cosine and sine), `attitude` (a quaternion as tilt and
             heading), `body` (vectors of the world in the body's frame), `distance` (length and
             direction of offsets), `phases` (differences of angles and directions that turn wholly).
-
-    Returns:
-        The coordinates; None for the observation itself.
     """
     if leave_out and system in (OBSERVATION, "angles"):
         raise InputError(f"nothing can be left out of {system}: give coordinates or symmetry")
@@ -59,12 +56,9 @@ def make_coordinates(
 
 
 class _Maker:
-    """Makes the parts of a task's coordinates, one kind of features at a time.
+    """Makes the parts of a task's coordinates, of some ingredients, one kind of features at a time.
 
-    Args:
-        task: whose features they are made of.
-        used: ingredients.
-        invariant: whether to leave out what shifting and turning the world changes.
+    Invariant ones leave out what shifting and turning the world changes.
     """
 
     def __init__(self, task: Task, used: Collection[str], invariant: bool):
@@ -152,7 +146,6 @@ class _Maker:
         return self._same(unit)
 
     def _unturned(self, unit: _Features) -> InputError:
-        """The mistake of a vector in the world of a body that may be turned in any way."""
         return InputError(
             f"{self._task.name} has {_word(unit)} in the world, but no feature says how its "
             "body is turned: symmetry needs a quaternion, or an angle in the world"

@@ -13,16 +13,10 @@ Array = NDArray[np.float64]
 
 
 def placed(task: Task, rows: Array, like: NDArray[Any]) -> Array:
-    """The same robots, turned and shifted to where others stand.
+    """The same robots, in observations (n, d), turned and shifted to where those `like` them stand.
 
-    Args:
-        task: of the observations.
-        rows: observations (n, d) in physical units.
-        like: those (n, d) of robots that stand and head as these are to.
-
-    Returns:
-        Rows with the headings of the others, and with the x and y of their first point in the
-        world, if they have one. All else stays as seen from the robot.
+    They get the headings of the others, and the x and y of their first point in the world, if they
+    have one. All else stays as seen from the robot.
     """
     moved, turn = rows.copy(), _heading(task, like) * _heading(task, rows).conj()
     half = np.sqrt(turn)  # of the turn: half its angle

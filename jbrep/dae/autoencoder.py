@@ -1,14 +1,14 @@
 """Autoencoders, plain and denoising: a row is reconstructed, from a corrupted one with noise."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from msgspec import Meta, field
-from torch import Tensor
+from msgspec import Meta
+from torch import Tensor, nn
 
-from jbrep.dae.gradient import Gradient
 from jbrep.dataset import ScaledDataset
 from jbrep.errors import InputError
 from jbrep.training import settings
@@ -26,9 +26,7 @@ class Autoencoder(Network, Reconstructing, frozen=True, kw_only=True):
 
     architecture: settings.Architecture = _PAPER.name
     epochs: settings.Epochs = _PAPER.epochs
-    batch_size: settings.BatchSize = None
     learning_rate: settings.LearningRate = _PAPER.learning_rate
-    seed: settings.Seed = 0
     initial: Annotated[
         Literal["torch", "normal"],
         Meta(
@@ -36,7 +34,6 @@ class Autoencoder(Network, Reconstructing, frozen=True, kw_only=True):
             "0."
         ),
     ] = "torch"
-    weights: settings.FeatureWeights = field(default_factory=dict)
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
@@ -78,14 +75,8 @@ class DAE(Autoencoder, frozen=True, kw_only=True):
 class Reconstruction(Objective):
     """The mean squared error of a reconstruction.
 
-    Batches are (features, rows), corrupted and clean.
-
-    Args:
-        method: says the network.
-        size: scaled numbers d in a row.
-        weights: of each scaled number in the error, (d,); None for 1.
-        noise: standard deviation of the corruption.
-        shared_noise: whether one vector of noise corrupts all rows of a batch.
+    Batches are (features, rows), corrupted and clean. Weights are of each scaled number in the
+    error, (d,), None for 1; `noise` is the standard deviation of the corruption.
     """
 
     _weights: Tensor | None
@@ -108,14 +99,12 @@ class Reconstruction(Objective):
         self._gradient: Gradient | None = None
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Clean rows, twice."""
         clean = windows.rows(numbers).T.contiguous()
         return clean, clean
 
     def draws(
         self, windows: Windows, numbers: Tensor, size: int, generator: torch.Generator
     ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Corrupted and clean rows."""
         clean = windows.rows(numbers).T.contiguous()
         for part in clean.split(size, 1) if self._shared else (clean,):
             corrupted = self._corrupt(part, generator)
@@ -142,8 +131,79 @@ class Reconstruction(Objective):
         return self._gradient(corrupted, clean)
 
     def rate(self, progress: float, step: int) -> float:
-        """As for `Objective`; the paper's doesn't fall."""
         return super().rate(progress, step) if self._decays else 1
 
     def layers(self) -> tuple[Layers, Layers]:
         return layers(self.encoder), layers(self.decoder)
+
+
+class Gradient:
+    """Computes the gradients of the mean squared error of a stack of layers, written out.
+
+    With so few features a step is limited by memory access and by the number of operations: with
+    features first, in preallocated buffers, it takes about half of autograd's time
+    (benchmarks/encoders.py). Modules are nn.Linear, each followed by nn.ReLU, nn.Tanh, or neither;
+    `rows` is the largest batch.
+    """
+
+    def __init__(self, modules: Iterable[nn.Module], rows: int, weights: Tensor | None = None):
+        self.rows = rows
+        self._weights = None if weights is None else weights[:, None]
+        stack = [*modules, nn.Identity()]
+        self._layers = [
+            (module, after) for module, after in pairwise(stack) if isinstance(module, nn.Linear)
+        ]
+        self._outputs = [p.bias.new_empty(len(p.bias) * rows) for p, _ in self._layers]
+        self._errors = [torch.empty_like(output) for output in self._outputs]
+        for linear, _ in self._layers:
+            for parameter in linear.parameters():
+                parameter.grad = torch.zeros_like(parameter)
+
+    @torch.no_grad()
+    def __call__(self, values: Tensor, target: Tensor) -> Tensor:
+        """Set every parameter's gradient, and return the mean squared error.
+
+        Values and the target to come close to are (features, rows).
+        """
+        inputs = [values, *self._cut(self._outputs, values.shape[1])]
+        for (linear, activation), before, after in zip(
+            self._layers, inputs[:-1], inputs[1:], strict=True
+        ):
+            torch.addmm(linear.bias[:, None], linear.weight, before, out=after)
+            _activate(activation, after)
+        errors = self._cut(self._errors, values.shape[1])
+        error = torch.sub(inputs[-1], target, out=errors[-1])
+        if self._weights is None:
+            loss = torch.dot(error.view(-1), error.view(-1)) / error.numel()
+        else:
+            loss = torch.sum(error.square() * self._weights) / error.numel()
+            error.mul_(self._weights)
+        error.mul_(2 / error.numel())
+        for i, (linear, activation) in reversed(list(enumerate(self._layers))):
+            _differentiate(activation, inputs[i + 1], errors[i])
+            torch.mm(errors[i], inputs[i].T, out=linear.weight.grad)
+            torch.sum(errors[i], 1, out=linear.bias.grad)
+            if i:
+                torch.mm(linear.weight.T, errors[i], out=errors[i - 1])
+        return loss
+
+    def _cut(self, buffers: list[Tensor], rows: int) -> list[Tensor]:
+        """The part of each buffer that this many rows occupy, (features, rows)."""
+        sizes = [len(linear.bias) for linear, _ in self._layers]
+        return [b[: n * rows].view(n, rows) for n, b in zip(sizes, buffers, strict=True)]
+
+
+def _activate(activation: nn.Module, values: Tensor) -> None:
+    """Apply an activation in place."""
+    if isinstance(activation, nn.Tanh):  # as 2 sigmoid(2x) - 1: a third of torch.tanh's time
+        values.mul_(2).sigmoid_().mul_(2).sub_(1)
+    elif isinstance(activation, nn.ReLU):
+        values.clamp_min_(0)
+
+
+def _differentiate(activation: nn.Module, output: Tensor, error: Tensor) -> None:
+    """Turn the error at an activation's output into that at its input, overwriting both."""
+    if isinstance(activation, nn.Tanh):
+        torch.addcmul(error, error, output.square_(), value=-1, out=error)
+    elif isinstance(activation, nn.ReLU):
+        torch.ops.aten.threshold_backward.grad_input(error, output, 0, grad_input=error)

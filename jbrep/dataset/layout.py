@@ -7,9 +7,9 @@ from msgspec import Meta
 
 from jbrep.records.record import Record
 
-_Name = Annotated[str, Meta(min_length=1, max_length=1000, title="the name of a column")]
+_Name = Annotated[str, Meta(min_length=1, max_length=1000)]
 _Names = tuple[_Name, ...]
-_Seconds = Annotated[float, Meta(gt=0, le=1e9, title="a time above 0")]
+_Seconds = Annotated[float, Meta(gt=0, le=1e9)]
 
 
 class Layout(Record, frozen=True, kw_only=True):
@@ -68,7 +68,7 @@ class Layout(Record, frozen=True, kw_only=True):
         Meta(description="An episode is cut after so many rows."),
     ] = None
     rate: Annotated[
-        Annotated[float, Meta(gt=0, le=1e6, title="a rate above 0, at most 1e6")] | None,
+        Annotated[float, Meta(gt=0, le=1e6)] | None,
         Meta(description="Bring the rows to an even clock of so many a second [Hz]."),
     ] = None
     fill: Annotated[

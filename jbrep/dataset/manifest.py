@@ -1,76 +1,58 @@
-"""What has been committed to a data set's folder; a shard counts once the manifest names it."""
+"""A data set's folder: shards of whole episodes, and the manifest that lists them.
+
+A shard is an HDF5 file of flat columns. jbrep itself needs no HDF5 to read one: the manifest says
+where each column begins.
+"""
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+import mmap
+import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
-from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
-from jbrep.dataset.shard import (
-    REPAIR,
-    Checked,
-    Shard,
-    column_hashes,
-    file_hash,
-    file_state,
-    map_file,
-    shard_image,
-)
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
 from jbrep.records.commit import Commits, commits
 from jbrep.records.document import Document, document_from, parse_json
 from jbrep.records.record import Record, Sha256, Version
-from jbrep.records.storage import MissingFileError, exists, read_regular, write_whole
+from jbrep.records.storage import exists, write_whole
 
 MANIFEST = "manifest.json"
-BACKUP = "manifest.backup.json"
+REPAIR = "run jbrep data repair to make it again"
+_HASH = "sha256"  # of all else in the manifest
 _PACKAGES = ("jbrep", "mujoco", "numpy", "h5py")
-_HASH = "sha256"  # of the rest of the manifest
 
-_Count = Annotated[int, Meta(ge=1, le=1 << 62)]
+_Count = Annotated[int, Meta(ge=1)]
 
 
 class Entry(Record, frozen=True, kw_only=True):
-    """A committed shard."""
+    """A shard."""
 
     bytes: _Count
     rows: _Count
     episodes: _Count
-    xxh3: Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z", title="an XXH3")]  # of the file
-    sha256: Mapping[str, Sha256]  # of each column
+    sha256: Sha256  # of the file
+    offsets: Mapping[str, Annotated[int, Meta(ge=0)]]  # where each column begins [bytes]
 
 
 class Manifest(Document, frozen=True, kw_only=True):
-    """What has been committed to a data set's folder."""
+    """What is in a data set's folder; all shards but the last one are full."""
 
     format: ClassVar[str] = "jbrep data set"
-    format_version: ClassVar[int] = 3
-    max_bytes: ClassVar[int] = 1 << 25  # each shard takes 1.5 kB of it
+    format_version: ClassVar[int] = 4
     indent: ClassVar[int] = 1
 
     settings: DataSettings
     versions: Mapping[Version, Version]  # of the packages that made it
     commits: Commits = {}
     shards: tuple[Entry, ...] = ()
-
-    def check(self) -> None:
-        """As for `Record`: the shards' numbers are possible, all but the last one full."""
-        if missing := set(_PACKAGES) - set(self.versions):
-            raise InputError(f"versions.{min(missing)} is missing")
-        columns, full = set(self.settings.specs()), self.settings.shard_episodes
-        for shard, entry in enumerate(self.shards):
-            is_last = shard == len(self.shards) - 1
-            if not (entry.episodes == full or (is_last and entry.episodes < full)):
-                raise InputError(f"shard {shard} has {entry.episodes:,} episodes, not {full:,}")
-            if not entry.episodes <= entry.rows <= self.task.max_episode_steps * entry.episodes:
-                raise InputError(f"shard {shard} can't have {entry.rows:,} rows")
-            if entry.sha256.keys() != columns:
-                raise InputError(f"shard {shard} has other columns than the settings ask for")
 
     @property
     def task(self) -> Task:
@@ -79,44 +61,28 @@ class Manifest(Document, frozen=True, kw_only=True):
 
     @property
     def rows(self) -> int:
-        """Number of rows committed."""
+        """How many there are."""
         return sum(entry.rows for entry in self.shards)
 
     @property
     def episodes(self) -> int:
-        """Number of episodes committed."""
+        """How many there are."""
         return sum(entry.episodes for entry in self.shards)
 
     @property
+    def bytes(self) -> int:
+        """Of all shards."""
+        return sum(entry.bytes for entry in self.shards)
+
+    @property
     def complete(self) -> bool:
-        """Whether all that the settings ask for has been committed."""
+        """Whether there are as many rows as the settings ask for."""
         return self.rows >= self.settings.steps
 
-    @property
-    def fingerprint(self) -> str:
-        """SHA-256 over the hashes of all columns: it identifies the data."""
-        parts = (f"{name} {digest}\n" for e in self.shards for name, digest in e.sha256.items())
-        return hashlib.sha256("".join(parts).encode()).hexdigest()
-
-    def extended(self, steps: int) -> "Manifest":
-        """The manifest of so many steps, before what it lacks is collected."""
-        return self.replace(settings=self.settings.replace(steps=steps))
-
-    @property
-    def full_shards(self) -> int:
-        """Number of shards that no episode is added to."""
-        return self.episodes // self.settings.shard_episodes
-
-    def is_next(self, other: "Manifest") -> bool:
-        """Whether a collector writes the other manifest after this one."""
-        more = max(self.settings.steps, other.settings.steps)
-        kept, added = self.shards[: self.full_shards], other.shards[self.full_shards :]
-        begun = other.shards == self.shards or (
-            other.shards[: self.full_shards] == kept
-            and len(added) == 1
-            and other.episodes > self.episodes
-        )
-        return begun and other == self.extended(more).replace(shards=other.shards)
+    def text(self) -> str:
+        """The text of its file, with a hash of all that it says."""
+        plain = self.as_json()
+        return json.dumps({**plain, _HASH: _digest(plain)}, indent=self.indent) + "\n"
 
     def attributes(self, shard: int, rows: int) -> dict[str, Any]:
         """The HDF5 attributes of a shard's file."""
@@ -136,26 +102,9 @@ class Manifest(Document, frozen=True, kw_only=True):
             "versions": json.dumps(dict(self.versions)),
         }
 
-    def as_json(self) -> dict[str, Any]:
-        """The manifest as plain JSON, with the name of the task and only commits that there are."""
-        plain = {**super().as_json(), "settings": self.settings.as_json()}
-        return plain if self.commits else {n: v for n, v in plain.items() if n != "commits"}
 
-    def text(self) -> str:
-        """The text of its file, with a hash of all the rest."""
-        return _hashed(self.as_json())
-
-
-def _hashed(plain: dict[str, Any]) -> str:
-    """The text of a manifest's file as jbrep writes it; any other byte is damage."""
-    body = {key: value for key, value in plain.items() if key != _HASH}
-    digest = hashlib.sha256(json.dumps(body).encode()).hexdigest()
-    return json.dumps({**body, _HASH: digest}, indent=Manifest.indent) + "\n"
-
-
-def shard_name(shard: int) -> str:
-    """File name of a shard."""
-    return f"shard-{shard:05d}.h5"
+def _digest(plain: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(plain).encode()).hexdigest()
 
 
 def new_manifest(settings: DataSettings, source: Manifest | None = None) -> Manifest:
@@ -178,202 +127,118 @@ def new_manifest(settings: DataSettings, source: Manifest | None = None) -> Mani
     return Manifest(settings=settings, versions=versions, commits=dict(commits()))
 
 
-def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
-    """Read the manifest of a data set, or its backup, and check every byte of it.
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a data set.
 
     Raises:
         DamageError: it isn't what jbrep wrote.
     """
-    path = folder / name
+    path = folder / MANIFEST
     try:
-        return _manifest_from(read_regular(path, Manifest.max_bytes), path)
-    except MissingFileError:
-        raise _explain_missing(path) from None
-    except DamageError as error:
-        raise DamageError(f"{error}; {REPAIR}") from None
-
-
-def current_manifest(folder: Path) -> Manifest:
-    """The manifest of what is in the folder, as `read_manifest` reads it.
-
-    It is the backup, if a collector was killed, or is at work, between the last shard and the
-    manifest that names it.
-    """
-    manifest = read_manifest(folder)
-    count = len(manifest.shards)
-    is_added = _size(folder, count) is not None
-    is_other = count > 0 and _size(folder, count - 1) not in (None, manifest.shards[-1].bytes)
-    if is_added or is_other:
-        with suppress(InputError):
-            backup = read_manifest(folder, BACKUP)
-            size = _size(folder, len(backup.shards) - 1)
-            if manifest.is_next(backup) and backup.shards and backup.shards[-1].bytes == size:
-                return backup
+        raw = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(
+            f"no data set in {folder}: expected a folder that jbrep collect wrote, with {MANIFEST}"
+        ) from None
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error
+    given = parse_json(raw, path, Manifest.format)
+    stated = given.pop(_HASH, None)
+    manifest = document_from(given, path, Manifest)
+    if stated != _digest(given):
+        raise DamageError(f"{path} is damaged: collect again in another folder")
     return manifest
-
-
-def _size(folder: Path, shard: int) -> int | None:
-    try:
-        return (folder / shard_name(shard)).lstat().st_size
-    except OSError:
-        return None
-
-
-def _manifest_from(raw: bytes, path: Path) -> Manifest:
-    plain = parse_json(raw, path, Manifest.format)
-    damage = DamageError(f"{path} is damaged: it isn't what jbrep wrote")
-    if raw != _hashed(plain).encode():
-        raise damage
-    del plain[_HASH]
-    settings = plain.get("settings")
-    if isinstance(settings, dict):  # which have the task's name besides
-        settings = {name: value for name, value in settings.items() if name != "task"}
-    manifest = document_from({**plain, "settings": settings}, path, Manifest)
-    if manifest.as_json() != plain:
-        raise damage
-    return manifest
-
-
-def _explain_missing(path: Path) -> InputError:
-    """The error for a manifest, or its backup, that isn't there: with what helps."""
-    folder, other = path.parent, BACKUP if path.name == MANIFEST else MANIFEST
-    files = hdf5_files(folder)
-    if exists(folder / other):
-        if path.name == MANIFEST and not files and _is_empty_backup(folder):
-            return InputError(
-                f"nothing has been collected in {folder} yet: run the same jbrep collect again"
-            )
-        return DamageError(f"{path} is missing: {REPAIR}")
-    if files:
-        return DamageError(
-            f"{folder} has {len(files)} HDF5 files but neither {MANIFEST} nor {BACKUP}, without "
-            "which they can't be checked: collect again in another folder"
-        )
-    return InputError(f"no data set in {folder}: expected a folder that jbrep collect wrote")
-
-
-def _is_empty_backup(folder: Path) -> bool:
-    """Whether the collector was killed before its first manifest, once the backup was there."""
-    try:
-        return not read_manifest(folder, BACKUP).shards
-    except InputError:
-        return False
-
-
-def open_shard(
-    folder: Path, manifest: Manifest, shard: int, checked: set[Checked] | None = None
-) -> Shard:
-    """Open a shard once its bytes have been checked against the manifest.
-
-    Args:
-        folder: of the data set.
-        manifest: with the size and the hash of the shard.
-        shard: its number.
-        checked: shards that have been checked before, with the states that their files were in;
-            this one is added. A file in one of these states isn't hashed again.
-
-    Raises:
-        DamageError: the bytes differ, or the file is missing.
-    """
-    path, entry = folder / shard_name(shard), manifest.shards[shard]
-    state = file_state(path)  # before it is mapped: a file replaced in between is hashed again
-    content = map_file(path)
-    if checked is None or (shard, state) not in checked:
-        if len(content) != entry.bytes or file_hash(content) != entry.xxh3:
-            raise DamageError(
-                f"{path} is damaged: its content isn't what was committed: its checksum doesn't "
-                f"match; {REPAIR}"
-            )
-        if checked is not None:
-            checked.add((shard, state))
-    specs, most = manifest.settings.specs(), manifest.task.max_episode_steps
-    return Shard(path, content, specs, entry.rows, entry.episodes, most)
-
-
-def hdf5_files(folder: Path) -> list[Path]:
-    """The files that should be shards.
-
-    List them before reading the manifest: it then names all those that a collector has committed.
-    """
-    try:
-        return sorted(folder.glob("*.h5"))
-    except OSError:
-        return []  # the manifest can't be read either
-
-
-def check_files(folder: Path, manifest: Manifest, files: list[Path]) -> None:
-    """Check that the files are the shards of the manifest, by name and size.
-
-    Raises:
-        DamageError: one is missing, has another size, or isn't in the manifest.
-    """
-    for problem in file_problems(folder, manifest, files):
-        raise DamageError(problem)
-
-
-def file_problems(folder: Path, manifest: Manifest, files: list[Path]) -> Iterator[str]:
-    """What `check_files` raises, as a line for each file."""
-    for shard, entry in enumerate(manifest.shards):
-        path, size = folder / shard_name(shard), _size(folder, shard)
-        if size is None:
-            yield f"{path} is missing: {REPAIR}"
-        elif size != entry.bytes:
-            yield (f"{path} is damaged: it has {size:,} bytes instead of {entry.bytes:,}; {REPAIR}")
-    for path in unlisted_files(manifest, files):
-        yield f"{path} is not one of the {len(manifest.shards)} shards of the data set"
-
-
-def unlisted_files(manifest: Manifest, files: list[Path]) -> list[Path]:
-    """Files that are neither in the manifest nor the shard being committed."""
-    known = {shard_name(shard) for shard in range(len(manifest.shards))}
-    if not manifest.complete:
-        known.add(shard_name(len(manifest.shards)))
-    return [path for path in files if path.name not in known]
-
-
-def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
-    """Add episodes to the last shard, or begin another one if that is full.
-
-    At every moment the manifest or its backup names what is there, see `current_manifest`.
-
-    Args:
-        folder: of the data set.
-        manifest: of what is there.
-        columns: of the episodes, no more than the shard lacks.
-
-    Returns:
-        The manifest that names them, too.
-    """
-    shard = manifest.full_shards
-    if shard < len(manifest.shards):
-        columns = joined([dict(open_shard(folder, manifest, shard)), columns])
-    entry, image = _entry_and_image(manifest, shard, columns)
-    manifest = manifest.replace(shards=(*manifest.shards[:shard], entry))
-    manifest.write(folder / BACKUP)
-    write_whole(folder / shard_name(shard), image)
-    manifest.write(folder / MANIFEST)
-    return manifest
-
-
-def write_shard(folder: Path, manifest: Manifest, shard: int, columns: Columns) -> Entry:
-    """Write a shard's file; it counts once a manifest names it."""
-    entry, image = _entry_and_image(manifest, shard, columns)
-    write_whole(folder / shard_name(shard), image)
-    return entry
-
-
-def _entry_and_image(manifest: Manifest, shard: int, columns: Columns) -> tuple[Entry, bytes]:
-    """What the manifest says of a shard, and the bytes of its file."""
-    rows, episodes = len(columns["step"]), len(columns[EPISODES + "length"])
-    hashes = column_hashes(columns)
-    image = shard_image(columns, hashes, manifest.attributes(shard, rows))
-    entry = Entry(
-        bytes=len(image), rows=rows, episodes=episodes, xxh3=file_hash(image), sha256=hashes
-    )
-    return entry, image
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write the backup, then the manifest, in place of the previous ones."""
-    for name in (BACKUP, MANIFEST):
-        manifest.write(folder / name)
+    """Write it in place of the previous one."""
+    manifest.write(folder / MANIFEST)
+
+
+def shard_path(folder: Path, shard: int) -> Path:
+    """The file of a shard."""
+    return folder / f"shard-{shard:05d}.h5"
+
+
+def check_sizes(folder: Path, manifest: Manifest) -> None:
+    """Make sure that all shards are there, by their sizes.
+
+    Raises:
+        DamageError: one is missing, or has another size.
+    """
+    for shard, entry in enumerate(manifest.shards):
+        path = shard_path(folder, shard)
+        _check_size(path, path.stat().st_size if exists(path) else None, entry)
+
+
+def _check_size(path: Path, size: int | None, entry: Entry) -> None:
+    if size is None:
+        raise DamageError(f"{path} is missing: {REPAIR}")
+    if size != entry.bytes:
+        raise DamageError(
+            f"{path} is damaged: it has {size:,} bytes instead of {entry.bytes:,}; {REPAIR}"
+        )
+
+
+def open_shard(folder: Path, manifest: Manifest, shard: int, *, known: bool = False) -> Columns:
+    """The columns of a shard, as read-only views of its file.
+
+    Args:
+        folder: of the data set.
+        manifest: that lists the shard.
+        shard: its number.
+        known: whether its hash has been checked before; its size always is.
+
+    Raises:
+        DamageError: its bytes aren't those that were written, or the file is missing.
+    """
+    path, entry = shard_path(folder, shard), manifest.shards[shard]
+    try:
+        with path.open("rb") as file:
+            _check_size(path, os.fstat(file.fileno()).st_size, entry)
+            content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except FileNotFoundError:
+        raise DamageError(f"{path} is missing: {REPAIR}") from None
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error
+    if not known and hashlib.sha256(content).hexdigest() != entry.sha256:
+        raise DamageError(f"{path} is damaged: its SHA-256 isn't the manifest's; {REPAIR}")
+    columns = dict[str, NDArray[Any]]()
+    for name, spec in manifest.settings.specs().items():
+        shape = (entry.episodes if name.startswith(EPISODES) else entry.rows, *spec.row)
+        columns[name] = np.ndarray(shape, spec.dtype, content, entry.offsets[name])
+    return columns
+
+
+def shard_image(manifest: Manifest, shard: int, columns: Columns) -> tuple[Entry, bytes]:
+    """What the manifest says of a shard, and the bytes of its file: equal ones of equal columns."""
+    import h5py  # slow to import, and readers don't need it
+
+    rows, episodes = len(columns["step"]), len(columns[EPISODES + "length"])
+    with h5py.File.in_memory() as file:
+        file.attrs.update(manifest.attributes(shard, rows))
+        made = {name: file.create_dataset(name, data=values) for name, values in columns.items()}
+        file.flush()
+        image: bytes = file.id.get_file_image()
+        offsets = {name: each.id.get_offset() for name, each in made.items()}
+    digest = hashlib.sha256(image).hexdigest()
+    entry = Entry(bytes=len(image), rows=rows, episodes=episodes, sha256=digest, offsets=offsets)
+    return entry, image
+
+
+def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
+    """Write the next shard, then the manifest that lists it, which is returned.
+
+    Args:
+        folder: of the data set.
+        manifest: of the shards before it.
+        columns: of its episodes.
+    """
+    path = shard_path(folder, len(manifest.shards))
+    if exists(path):  # the last shard, with fewer episodes: from now on it doesn't count
+        write_manifest(folder, manifest)
+    entry, image = shard_image(manifest, len(manifest.shards), columns)
+    write_whole(path, image)
+    manifest = manifest.replace(shards=(*manifest.shards, entry))
+    write_manifest(folder, manifest)
+    return manifest

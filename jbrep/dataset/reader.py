@@ -1,37 +1,28 @@
 """Reading a data set."""
 
-import resource
-from collections.abc import Sequence
+import hashlib
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset.columns import Batches, Column
-from jbrep.dataset.layout import Layout
-from jbrep.dataset.manifest import (
-    check_files,
-    current_manifest,
-    hdf5_files,
-    open_shard,
-    shard_name,
-)
-from jbrep.dataset.scaling import EXTREMA, Scaler, fit_scaler
-from jbrep.dataset.schema import EPISODES, Columns, episode_bounds, episode_columns
-from jbrep.dataset.shard import Checked, FileState, file_state
-from jbrep.envs.task import Task
-from jbrep.errors import DamageError, InputError
+from jbrep.dataset.columns import Column
+from jbrep.dataset.manifest import check_sizes, open_shard, read_manifest
+from jbrep.dataset.scaling import EXTREMA, Scaler, extrema, fit_scaler, mean_and_std
+from jbrep.dataset.schema import Columns, episode_bounds, episode_columns
+from jbrep.dataset.settings import policy_text
+from jbrep.errors import InputError
+from jbrep.text import Table, counted, facts, html, number
 
-if TYPE_CHECKING:
-    from jbrep.dataset.formats.episodes import Source
-
-_OPEN_SHARDS = 256  # memory-mapped at a time, at most: each takes a file descriptor
-_MEMORY = 4 << 30  # [bytes]
+_OPEN_SHARDS = 100  # memory-mapped at a time, at most: each takes a file descriptor
+_AHEAD = 8  # shards that are checked at a time, at most
+_RANGES = ("feature", "unit", "min", "mean", "max", "std", "usual range")
 
 
 class Split(NamedTuple):
@@ -72,164 +63,48 @@ class Episode:
 
 
 class Dataset:
-    """A collected data set; every shard is checked against the manifest before it is read.
+    """A data set: the shards that were there when it was opened.
 
     `dataset["observation"]` is a `Column`: one array over all shards that copies only what is
     asked for. So are the other columns, the groups of features (`dataset["velocity"]`) and the
-    single features (`dataset["velocity_x"]`). While a collector writes, it is the part committed
-    when the data set was opened. A shard that changes on disk is checked again when it is next
-    used; arrays taken from it before are views of the file, and may change with it.
+    single features (`dataset["velocity_x"]`). Each shard is checked against its hash once, before
+    its first row is read.
 
     Args:
-        folder: that `jbrep collect`, `jbrep data import` or `Dataset.write` wrote.
+        folder: that `jbrep collect` or `jbrep data import` wrote.
 
     Attributes:
         manifest: settings, versions and hashes.
         task: the task whose features the observations hold.
 
     Raises:
-        DamageError: a file is damaged, missing or not part of the data set; also later, when
-            rows of a damaged shard are read.
+        DamageError: a file is damaged or missing; also later, when rows of a damaged shard are
+            read.
     """
 
     def __init__(self, folder: str | Path):
         self.folder = Path(folder)
-        files = hdf5_files(self.folder)
-        self.manifest = current_manifest(self.folder)
-        check_files(self.folder, self.manifest, files)
+        self.manifest = read_manifest(self.folder)
+        check_sizes(self.folder, self.manifest)
         self.task = self.manifest.task
-        self._checked: set[Checked] = set()
-        self._opened = lru_cache(_open_at_once())(self._open)
-        shards = range(len(self.manifest.shards))
-        self._paths = [self.folder / shard_name(k) for k in shards]  # looked at for every chunk
+        self._known: set[int] = set()  # shards whose hashes have been checked
+        self._shard = lru_cache(_OPEN_SHARDS)(self._open)
         self._ends = list(accumulate(entry.rows for entry in self.manifest.shards))
         self._specs = self.manifest.settings.step_specs()
 
-    @staticmethod
-    def write(
-        folder: str | Path,
-        observations: Any,
-        actions: Any,
-        rewards: Any,
-        terminations: Any,
-        truncations: Any = None,
-        *,
-        final_observations: Any = None,
-        seeds: Any = None,
-        task: Task | str | None = None,
-        source: str = "arrays",
-    ) -> "Dataset":
-        """Write a data set of arrays, whole or not at all.
+    def _open(self, shard: int) -> Columns:
+        """A shard, once its hash has been checked: with those of the next ones, on all cores."""
 
-        The first five are of all episodes, one after the other: N steps of d features and actions
-        of k numbers. Or each is a list of such arrays, one for each of the n episodes.
+        def check(other: int) -> None:
+            with suppress(InputError):  # which is raised when that one is opened
+                open_shard(self.folder, self.manifest, other)
+                self._known.add(other)
 
-        Args:
-            folder: new.
-            observations: before each action, (N, d). In a list, the observations of an episode may
-                have one row more than the rest: the final one.
-            actions: (N, k).
-            rewards: (N,); None where none are known.
-            terminations: whether a state ended the episode at that step, (N,).
-            truncations: whether anything else did, such as a time limit, (N,).
-            final_observations: after the last action of each episode, (n, d). Where they aren't
-                known, the last step of each episode is left out, so that its observation is the
-                final one, and the episode counts as truncated.
-            seeds: that the episodes were started with, (n,); -1 where one isn't known.
-            task: that they are of, or its name; made from the data alone if not given.
-            source: where they come from, a few words; also the id of a task made from the data.
-
-        Returns:
-            The data set.
-        """
-        from jbrep.dataset.formats.flat import source_of  # imports Gymnasium
-
-        columns = {"observation": observations, "action": actions, "reward": rewards}
-        columns |= {"terminated": terminations, "truncated": truncations}
-        once = {"final_observation": final_observations, "seed": seeds}
-        return _written(folder, source_of(columns, once, source), None, "", task)
-
-    @staticmethod
-    def from_table(
-        folder: str | Path,
-        table: Any,
-        layout: Layout | None = None,
-        *,
-        missing: str = "",
-        task: Task | str | None = None,
-        source: str = "table",
-    ) -> "Dataset":
-        """Write a data set of a table's rows, such as a robot's log, whole or not at all.
-
-        Args:
-            folder: new.
-            table: a frame of pandas or polars, a table of pyarrow's, or a dict of columns.
-            layout: what its columns are, and what becomes of its rows.
-            missing: what becomes of numbers that are missing: skip, or hold:3 and the like.
-            task: that the rows are of, or its name; made from the data alone if not given.
-            source: where they come from, a few words; also the id of a task made from the data.
-
-        Returns:
-            The data set.
-        """
-        from jbrep.dataset.formats.arrow import table_of
-        from jbrep.dataset.formats.logs import source_of_table
-
-        opened = source_of_table(table_of(table, source), layout, missing)
-        return _written(folder, opened, layout, missing, task)
-
-    @staticmethod
-    def from_file(
-        folder: str | Path,
-        file: str | Path,
-        *more: str | Path,
-        layout: Layout | None = None,
-        missing: str = "",
-        task: Task | str | None = None,
-    ) -> "Dataset":
-        """Write a data set of others' files, whole or not at all, as `jbrep data import` does.
-
-        Args:
-            folder: new.
-            file: a log, or a data set of another tool, see docs/logs.md.
-            more: such files; an episode ends with each.
-            layout: as `from_table` takes it, like missing and task.
-            missing: likewise.
-            task: likewise; by default the one that the files name, if they do.
-
-        Returns:
-            The data set.
-
-        Raises:
-            ModuleNotFoundError: their format needs a package that isn't installed.
-        """
-        from jbrep.dataset.formats import open_sources
-
-        opened = open_sources([*map(str, (file, *more))], layout, missing)
-        return _written(folder, opened, layout, missing, task)
-
-    def _shard(self, shard: int) -> Columns:
-        """A shard as it is on disk now: another state of its file is another entry of the cache."""
-        return self._opened(shard, file_state(self._paths[shard]))
-
-    def _open(self, shard: int, state: FileState) -> Columns:
-        try:
-            return open_shard(self.folder, self.manifest, shard, self._checked)
-        except DamageError:
-            if (grown := self._grown(shard)) is None:
-                raise
-            return grown
-
-    def _grown(self, shard: int) -> Columns | None:
-        """What there was of a shard to which a collector has added episodes since; None if none."""
-        with suppress(InputError):
-            settings, now = self.manifest.settings, current_manifest(self.folder)
-            before, entry = self.manifest.shards[shard], now.shards[shard : shard + 1]
-            is_ours = now.settings.replace(steps=settings.steps) == settings
-            if is_ours and entry and entry[0].episodes > before.episodes:
-                whole = open_shard(self.folder, now, shard)
-                return whole.first(before.rows, before.episodes)
-        return None
+        if shard not in self._known:
+            unknown = [k for k in range(shard, len(self._ends)) if k not in self._known]
+            with ThreadPoolExecutor() as pool:
+                list(pool.map(check, unknown[:_AHEAD]))
+        return open_shard(self.folder, self.manifest, shard, known=shard in self._known)
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -239,11 +114,6 @@ class Dataset:
 
     def __repr__(self) -> str:
         return f"Dataset({str(self.folder)!r}: {self.task.name}, {len(self):,} rows)"
-
-    def _repr_html_(self) -> str:
-        from jbrep.dataset.card import card_html
-
-        return card_html(self)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -278,11 +148,19 @@ class Dataset:
         """Columns with a row for each episode: seed, length, return, terminated and more."""
         specs = episode_columns(self.manifest.settings.specs())
         parts = {name: [np.empty((0, *spec.row), spec.dtype)] for name, spec in specs.items()}
-        for number in range(len(self.manifest.shards)):
-            shard = self._shard(number)
-            for name, each in parts.items():
-                each.append(shard[EPISODES + name].copy())  # a view would keep the file open
+        for shard in range(len(self._ends)):
+            for name, each in episode_columns(self._shard(shard)).items():
+                parts[name].append(each.copy())  # a view would keep the file open
         return {name: np.concatenate(each) for name, each in parts.items()}
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 over the hashes of all columns, shard by shard: it identifies the data."""
+        whole = hashlib.sha256()
+        for shard in range(len(self._ends)):
+            for name, values in self._shard(shard).items():
+                whole.update(f"{name} {hashlib.sha256(values.data).hexdigest()}\n".encode())
+        return whole.hexdigest()
 
     @cached_property
     def _bounds(self) -> NDArray[np.int64]:
@@ -329,46 +207,111 @@ class Dataset:
         """The scaling of observations to [-1, 1] over some rows, such as the training part."""
         return fit_scaler(EXTREMA, self.task, self["observation"], rows)
 
-    def batches(
-        self,
-        rows: NDArray[np.int64] | None = None,
-        columns: Sequence[str] = ("observation",),
-        size: int = 8192,
-        seed: int = 0,
-        memory: int = _MEMORY,
-    ) -> Batches:
-        """Shuffled passes over rows, from memory or, if they don't fit, from disk.
+    def describe(self) -> dict[str, Any]:
+        """What it holds, how it was made, its returns and the ranges of its features.
 
-        Args:
-            rows: sorted row numbers; None takes all.
-            columns: names of columns, groups or features.
-            size: rows per batch.
-            seed: of the order.
-            memory: limit of the rows held in memory [bytes].
+        Returns:
+            Plain values, as JSON takes them; numbers that aren't finite are None.
         """
-        rows = np.arange(len(self)) if rows is None else rows
-        return Batches({name: self[name] for name in columns}, rows, size, seed, memory)
+        manifest, episodes = self.manifest, self.episodes
+        return {
+            "folder": str(self.folder),
+            **manifest.settings.as_json(),
+            "rows": len(self),
+            "episodes": len(episodes["length"]),
+            "terminated": int(episodes["terminated"].sum()),
+            "steps_per_episode": _spread(episodes["length"]),
+            "return": _spread(episodes.get("return", ())),
+            "columns": list(self.columns),
+            "shards": len(manifest.shards),
+            "complete": manifest.complete,
+            "bytes": manifest.bytes,
+            "versions": dict(manifest.versions),
+            "fingerprint": self.fingerprint,
+            "features": self._ranges() if len(self) else [],
+        }
+
+    def _ranges(self) -> list[dict[str, Any]]:
+        """Unit, extrema, mean and standard deviation of each feature, and its usual range."""
+        column = self["observation"]
+        (low, high), (mean, std) = extrema(column.chunks()), mean_and_std(column.chunks())
+        found = zip(self.task.features, low, mean, high, std, strict=True)
+        return [
+            {"feature": feature.name, "unit": feature.unit}
+            | dict(zip(_RANGES[2:6], map(float, values), strict=True))
+            | {"nominal": [feature.low, feature.high]}
+            for feature, *values in found
+        ]
+
+    def card(self, width: int = 80) -> str:
+        """`describe` as text of at most `width` columns."""
+        about = self.describe()
+        told = f"{self.folder}\n{facts(self._facts(about), width)}"
+        return f"{told}\n\n{_table(about).text(width)}" if len(self) else told
+
+    def _repr_html_(self) -> str:
+        about = self.describe()
+        told = Table(str(self.folder), ("", ""), [*self._facts(about).items()])
+        return html(told, *([_table(about)] if len(self) else ()))
+
+    def _facts(self, about: dict[str, Any]) -> dict[str, str]:
+        """What is known of the whole, for people."""
+        settings, task = self.manifest.settings, self.task
+        sizes = counted(task.size, "feature"), counted(task.action_size, "action")
+        unfinished = f"; unfinished, {settings.steps:,} rows were asked for"
+        named = {
+            "task": ", ".join([task.name, *sizes, *task.given_arguments]),
+            "policy": policy_text(settings.policy),
+            "seed": "-" if settings.is_imported else f"{settings.seed}",
+            "rows": f"{len(self):,}",
+            "episodes": _episodes_line(about),
+            "columns": ", ".join(self.columns),
+            "files": f"{counted(about['shards'], 'shard')}, {about['bytes'] / 1e6:,.1f} MB"
+            + ("" if about["complete"] else unfinished),
+            "made with": ", ".join(f"{name} {each}" for name, each in about["versions"].items()),
+            "fingerprint": about["fingerprint"],
+        }
+        if returns := about["return"]:
+            of = {name: number(value, ".1f") for name, value in returns.items()}
+            named["return"] = (
+                f"median {of['median']} [10 % {of['p10']}, 90 % {of['p90']}], mean {of['mean']}, "
+                f"from {of['min']} to {of['max']}"
+            )
+        if settings.reward:
+            named["reward"] = f"by {settings.reward}"
+        if settings.unrewarded:
+            named["return"] = "not known: the data have no rewards"
+        if settings.is_imported:
+            named["note"] = "the data were imported: no episode can be simulated again"
+        elif not task.reproducible:
+            named["note"] = "the environment is not reproducible: no episode can be simulated again"
+        return named
 
 
-def _open_at_once() -> int:
-    """How many shards to have open: they take half of the files that the process may, at most."""
-    most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    return _OPEN_SHARDS if most == resource.RLIM_INFINITY else min(_OPEN_SHARDS, most // 2)
+def _episodes_line(about: dict[str, Any]) -> str:
+    line = f"{about['episodes']:,}"
+    if lengths := about["steps_per_episode"]:
+        low, high = lengths["min"], lengths["max"]
+        line += f" of {low:,.0f}" + (f" to {high:,.0f} steps" if low != high else " steps")
+    ended = about["terminated"]
+    return f"{line}, {ended:,} terminated by a state" if ended else line
 
 
-def _written(
-    folder: str | Path,
-    source: "Source",
-    layout: Layout | None,
-    missing: str,
-    task: Task | str | None,
-) -> Dataset:
-    """A data set of what was opened."""
-    from jbrep.dataset.formats.writer import write
-    from jbrep.envs.description import as_task
-    from jbrep.envs.names import is_code
+def _table(about: dict[str, Any]) -> Table:
+    """The features and their ranges."""
+    rows = []
+    for each in about["features"]:
+        low, high = each["nominal"]
+        usual = "-" if low is None else f"[{number(low, '.4g')}, {number(high, '.4g')}]"
+        values = [number(each[name], ".4g") for name in _RANGES[2:6]]
+        rows.append((each["feature"], each["unit"], *values, usual))
+    return Table("", _RANGES, rows)
 
-    reward = layout.reward if layout and is_code(layout.reward) else ""
-    known = None if task is None else as_task(task)
-    write(source, Path(folder), known, missing=missing, reward=reward)
-    return Dataset(folder)
+
+def _spread(values: Any) -> dict[str, float]:
+    """Median, 10 % and 90 % quantiles, mean and extrema over the episodes, if there are any."""
+    if not len(values):
+        return {}
+    median, p10, p90 = np.percentile(values, (50, 10, 90)).tolist()
+    named = {"median": median, "p10": p10, "p90": p90, "mean": float(values.mean())}
+    return named | {"min": float(values.min()), "max": float(values.max())}

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.envs.names import code_named
-from jbrep.envs.origin import code_behind
+from jbrep.envs.names import code_named, code_of
 from jbrep.envs.task import Task
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import InputError, refusing
 
 Array = NDArray[Any]
 
@@ -25,13 +24,9 @@ def reward_function(code: str) -> Callable[[Array, Array], NDArray[np.float64]]:
     function = code_named(code, "reward")
 
     def rewards(observations: Array, actions: Array) -> NDArray[np.float64]:
-        try:
-            made = function(observations.copy(), actions.copy())
-            if np.iscomplexobj(made):
-                raise TypeError("it gives complex numbers")
-            given = np.asarray(made, float)
-        except Exception as error:
-            raise InputError(f"the reward {code} fails: {kind_and_line(error)}") from error
+        with refusing(f"the reward {code} fails"):
+            made = np.asarray(function(observations.copy(), actions.copy()))
+            given = made.astype(float, casting="same_kind")
         if given.shape != (len(actions),):
             raise InputError(
                 f"the reward {code} gives an array of shape {given.shape} for {len(actions)} "
@@ -49,7 +44,7 @@ def reward_function(code: str) -> Callable[[Array, Array], NDArray[np.float64]]:
 
 def with_hash(code: str) -> str:
     """The name of such a function with the hash of its code, as data of two codes differ."""
-    parts = sorted(code_behind(code_named(code, "reward")).items())
+    parts = sorted(code_of(code_named(code, "reward")).items())
     return f"{code} {hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]}"
 
 

@@ -14,7 +14,6 @@ from jbrep.coordinates import Coordinates
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import EXTREMA, NOMINAL, extrema, fit_scaler
 from jbrep.envs.task import Feature
-from jbrep.errors import InputError
 
 
 def sample(rows: NDArray[Any], most: int) -> NDArray[Any]:
@@ -51,14 +50,6 @@ class ScaledDataset:
         self.scaler = dataset.fit_scaler(self.train)
         self.scaling = EXTREMA
         self.used = np.arange(self.scaler.size)
-        unseen = dataset.fit_scaler(self.test)
-        ends = (self.scaler.low, self.scaler.high, unseen.low, unseen.high)
-        not_finite = np.asarray(~np.isfinite(ends).all(axis=0))
-        if not_finite.any():
-            bad = ", ".join(self._names(not_finite))
-            raise InputError(
-                f"{dataset.folder} has values that aren't finite in {bad}: run jbrep data verify"
-            )
 
     @classmethod
     def of(cls, data: "ScaledDataset | Dataset | str | Path") -> "ScaledDataset":
@@ -117,7 +108,7 @@ class ScaledDataset:
         low, high = self.scaler.low[self.used], self.scaler.high[self.used]
         if self.scaling == NOMINAL:  # the only one whose ranges aren't of these rows
             low, high = extrema(self.chunks(self.train))
-        return self._names(low == high)
+        return tuple(np.array(self.names)[low == high].tolist())
 
     @cached_property
     def reward_varies(self) -> bool:
@@ -143,9 +134,6 @@ class ScaledDataset:
         parts = self.dataset["reward"].parts(self.train)
         most = max(float(np.abs(part).max()) for part in parts)
         return math.ceil(math.log2(most)) if most else 0
-
-    def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
-        return tuple(np.array(self.names)[which].tolist())
 
     def observations(self, rows: NDArray[np.int64]) -> Iterator[NDArray[np.float32]]:
         """Observations of the rows in physical units, in order, in chunks (n, d)."""

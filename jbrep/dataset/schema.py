@@ -33,7 +33,6 @@ _Code = Annotated[
     Meta(
         pattern=r"(?a)\A[\w.]+:[\w.]+ [0-9a-f]{12}\Z",
         max_length=MAX_LETTERS,
-        title="module:function and a hash",
     ),
 ]
 
@@ -48,61 +47,6 @@ class Spec(NamedTuple):
 
 def _spec(dtype: str, *row: int, follows: Callable[[Columns], NDArray[Any]] | None = None) -> Spec:
     return Spec(np.dtype(dtype), row, follows)
-
-
-def _specs(
-    task: Task, store_state: bool, weights: Sequence[float], unrewarded: bool
-) -> dict[str, Spec]:
-    """The columns of each shard, by their paths in the file."""
-
-    def steps_of(known: Columns) -> NDArray[Any]:
-        rows, firsts = len(known["action"]), episode_bounds(known[length])[:-1]
-        return np.arange(rows) - np.repeat(firsts, known[length])
-
-    def parts(known: Columns) -> NDArray[Any]:
-        seeds = known[EPISODES + "seed"].tolist()
-        return np.array([episode_part(seed, weights) for seed in seeds], np.int64)
-
-    number, length = EPISODES + "episode", EPISODES + "length"
-    moving = {name: _spec("<f8", width) for name, width in task.state.items()}
-    steps = {  # a row for each step, in the order of episode, then step
-        "observation": _spec("<f4", task.size),  # before the action, in physical units
-        "action": _spec("<f4", task.action_size),  # within the task's bounds
-        "reward": _spec("<f4"),  # of the state that the action led to; 0 if the physics diverged
-        "episode": _spec("<i4", follows=lambda known: np.repeat(known[number], known[length])),
-        "step": _spec("<i4", follows=steps_of),  # from 0 in the episode
-    }
-    begins = {  # a row for each episode, as those below
-        "episode": _spec("<i4"),  # its number, from 0 in the data set
-        "seed": _spec("<i8"),
-        "length": _spec("<i4"),  # rows stored
-        "return": _spec(
-            "<f8", follows=lambda known: episode_returns(known["reward"], known[length])
-        ),
-        "terminated": _spec("|u1"),
-        "truncated": _spec("|u1"),
-    }
-    ends = {"final_observation": _spec("<f4", task.size)}  # after the last action
-    policy = {"policy": _spec("<i4", follows=parts)}  # the number of the part of a mixture
-    missing = {"missing": _spec("<i4")}  # readings, see `Task.missing`
-    for name in task.arrays:
-        if name in {**steps, **begins, **policy, **missing} or name.startswith(
-            ("initial_", "final_")
-        ):
-            raise InputError(f"{task.name} has an array {name!r}: data sets have such a column")
-    once = {
-        **begins,
-        **{f"initial_{name}": spec for name, spec in moving.items()},
-        **{name: _spec("<f8", width) for name, width in task.constants.items()},
-        **ends,
-        **({f"final_{name}": spec for name, spec in moving.items()} if store_state else {}),
-        **(policy if weights else {}),
-        **(missing if task.missing else {}),
-    }
-    by_step = steps | (moving if store_state else {})  # states with the observation
-    specs = by_step | {EPISODES + name: spec for name, spec in once.items()}
-    without = {"reward", EPISODES + "return"} if unrewarded else set()
-    return {name: spec for name, spec in specs.items() if name not in without}
 
 
 class DataSettings(CollectSettings, frozen=True, kw_only=True):
@@ -144,7 +88,51 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
 
     def specs(self) -> dict[str, Spec]:
         """The columns of each shard, by their paths in the file."""
-        return _specs(self.task, self.store_state, self.weights, bool(self.unrewarded))
+        task, number, length = self.task, EPISODES + "episode", EPISODES + "length"
+
+        def steps_of(known: Columns) -> NDArray[Any]:
+            rows, firsts = len(known["action"]), episode_bounds(known[length])[:-1]
+            return np.arange(rows) - np.repeat(firsts, known[length])
+
+        def parts(known: Columns) -> NDArray[Any]:
+            seeds = known[EPISODES + "seed"].tolist()
+            return np.array([episode_part(seed, self.weights) for seed in seeds], np.int64)
+
+        def returns(known: Columns) -> NDArray[Any]:
+            return episode_returns(known["reward"], known[length])
+
+        moving = {name: _spec("<f8", width) for name, width in task.state.items()}
+        steps = {  # a row for each step, in the order of episode, then step
+            "observation": _spec("<f4", task.size),  # before the action, in physical units
+            "action": _spec("<f4", task.action_size),  # within the task's bounds
+            "reward": _spec("<f4"),  # of the state that it led to; 0 if the physics diverged
+            "episode": _spec("<i4", follows=lambda known: np.repeat(known[number], known[length])),
+            "step": _spec("<i4", follows=steps_of),  # from 0 in the episode
+        }
+        once = {  # a row for each episode
+            "episode": _spec("<i4"),  # its number, from 0 in the data set
+            "seed": _spec("<i8"),
+            "length": _spec("<i4"),  # rows stored
+            "return": _spec("<f8", follows=returns),
+            "terminated": _spec("|u1"),
+            "truncated": _spec("|u1"),
+        }
+        policy = {"policy": _spec("<i4", follows=parts)}  # the number of the part of a mixture
+        missing = {"missing": _spec("<i4")}  # readings, see `Task.missing`
+        taken = {**steps, **once, **policy, **missing}
+        for name in task.arrays:
+            if name in taken or name.startswith(("initial_", "final_")):
+                raise InputError(f"{task.name} has an array {name!r}: data sets have such a column")
+        once |= {f"initial_{name}": spec for name, spec in moving.items()}
+        once |= {name: _spec("<f8", width) for name, width in task.constants.items()}
+        once["final_observation"] = _spec("<f4", task.size)  # after the last action
+        if self.store_state:
+            steps |= moving  # with the observation
+            once |= {f"final_{name}": spec for name, spec in moving.items()}
+        once |= (policy if self.weights else {}) | (missing if task.missing else {})
+        if self.unrewarded:
+            del steps["reward"], once["return"]
+        return steps | {EPISODES + name: spec for name, spec in once.items()}
 
     def step_specs(self) -> dict[str, Spec]:
         """Those with a row for each step."""
@@ -173,11 +161,8 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
 
 def episode_columns(columns: Mapping[str, Any]) -> dict[str, Any]:
     """What has a row for each episode, of columns or specs, by the names in the group."""
-    return {
-        name.removeprefix(EPISODES): each
-        for name, each in columns.items()
-        if name.startswith(EPISODES)
-    }
+    names = (name for name in columns if name.startswith(EPISODES))
+    return {name.removeprefix(EPISODES): columns[name] for name in names}
 
 
 def some_episodes(columns: Columns, first: int, stop: int) -> Columns:

@@ -1,11 +1,10 @@
 """What a user chooses of a data set besides its task: how much of it, and the policy that acts."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from jbrep.errors import InputError
 from jbrep.records.record import Record, Sha256, converted
 
 IMPORTED = "imported"  # data that were made elsewhere
@@ -14,18 +13,11 @@ TRAINED = "trained"  # of a run, kept in a file beside the shards
 MAX_LETTERS = 200  # of a text
 MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 
-_MAX_CONSTANTS = 1000
-
-_Line = Annotated[str, Meta(max_length=MAX_LETTERS)]
-_Number = Annotated[float, Meta(gt=-(10**12), lt=10**12, title="a number")]
-_List = Annotated[tuple[_Number | _Line, ...], Meta(max_length=_MAX_CONSTANTS)]
-_POLICY = "a kind and its constants, such as {'kind': 'constant', 'drive': 0.5}"
-_Constants = Annotated[
-    Mapping[_Line, _Number | _Line | _List], Meta(max_length=_MAX_CONSTANTS, title=_POLICY)
-]
-PolicySettings = Annotated[Mapping[str, Any], Meta(title=_POLICY)]
-_Kind = Annotated[str, Meta(pattern=r"\A[a-z-]+\Z", title="a word of small letters")]
-_Weight = Annotated[float, Meta(gt=0, lt=10**12)]
+_Line = Annotated[str, Meta(max_length=MAX_LETTERS, pattern=r"\A[^\x00-\x1f\x7f-\x9f]*\Z")]
+_Number = Annotated[float, Meta(gt=-(10**12), lt=10**12)]
+_Constants = Mapping[_Line, _Line | _Number]
+_Parts = tuple[tuple[Annotated[float, Meta(gt=0)], Mapping[str, Any]], ...]  # with their weights
+PolicySettings = Mapping[str, Any]
 
 
 class CollectSettings(Record, frozen=True, kw_only=True):
@@ -54,56 +46,33 @@ class CollectSettings(Record, frozen=True, kw_only=True):
     ] = False
 
 
-class _Mixture(Record, frozen=True, kw_only=True):
-    """Policies that are no mixtures, each with its weight."""
-
-    kind: Literal["mixture"]
-    parts: Annotated[
-        tuple[tuple[_Weight, Mapping[str, Any]], ...], Meta(min_length=2, max_length=_MAX_CONSTANTS)
-    ]
-
-    def check(self) -> None:
-        for _, part in self.parts:
-            check_policy(part)
-            if part["kind"] == MIXTURE:
-                raise InputError("the parts of a mixture must be other policies")
-
-
 class _Trained(Record, frozen=True, kw_only=True):
     """The policy of a run, in a file beside the shards and nowhere else."""
 
     kind: Literal["trained"]
-    file: Annotated[
-        str, Meta(pattern=r"(?a)\Apolicy-\d{1,3}\.safetensors\Z", title="policy-0.safetensors")
-    ]
+    file: Annotated[str, Meta(pattern=r"(?a)\A[\w-]+\.safetensors\Z")]
     sha256: Sha256
     run: _Line
-    step: Annotated[int, Meta(ge=0, lt=10**12)]
+    step: Annotated[int, Meta(ge=0)]
 
 
-def check_policy(policy: Mapping[str, Any]) -> None:
-    """Make sure that a policy is a kind and constants that fit it: numbers and short text."""
-    kind = policy.get("kind")
-    converted(kind, _Kind, "the kind of a policy")
-    converted(policy, {MIXTURE: _Mixture, TRAINED: _Trained}.get(str(kind), _Constants), "policy")
-    if not all(text.isprintable() for text in _texts([*policy.items()])):
-        raise InputError("the policy has text that can't be printed")
+def check_policy(policy: PolicySettings) -> None:
+    """Make sure that a policy, or each of a mixture, is a kind and constants that fit it."""
+    kind = converted(policy.get("kind"), _Line, "the kind of a policy")
+    if kind == MIXTURE:
+        parts = converted(policy.get("parts"), _Parts, "the parts of a mixture")
+        for _, part in parts:
+            check_policy(part)
+    else:
+        converted(policy, _Trained if kind == TRAINED else _Constants, "policy")
 
 
-def _texts(values: Iterable[Any]) -> Iterator[str]:
-    for value in values:
-        if isinstance(value, str):
-            yield value
-        elif isinstance(value, list | tuple):
-            yield from _texts(value)
-
-
-def parts_of(policy: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+def parts_of(policy: PolicySettings) -> Iterator[PolicySettings]:
     """The policies of a mixture, or else the policy itself."""
     yield from (part for _, part in policy["parts"]) if policy["kind"] == MIXTURE else (policy,)
 
 
-def policy_text(policy: Mapping[str, Any]) -> str:
+def policy_text(policy: PolicySettings) -> str:
     """A policy's kind and constants for people: "constant, drive 0.5"."""
     if policy["kind"] == MIXTURE:
         return "; ".join(f"{weight:.3g} of {policy_text(part)}" for weight, part in policy["parts"])

@@ -85,35 +85,24 @@ class BaseEncoder(ABC):
 
 
 def as_encoder(given: Any, task: Task) -> BaseEncoder:
-    """An encoder from whatever encodes, for a task's observations.
-
-    Args:
-        given: an encoder of jbrep; an object with `encode`, or any function; a torch module; or a
-            fitted transformer of scikit-learn.
-        task: whose observations it is to read.
-    """
+    """An encoder of jbrep, or whatever else encodes (see `OwnEncoder`), for a task."""
     encoder = given if isinstance(given, BaseEncoder) else OwnEncoder(given, task)
     encoder.check_task(task)
     return encoder
 
 
 class OwnEncoder(BaseEncoder):
-    """A user's own encoder: an object with `encode`, a function, or a torch module.
-
-    A transformer of scikit-learn that was fitted has `transform` and `inverse_transform` instead.
+    """A user's own encoder.
 
     It gets float32 observations (n, d) in physical units and returns latents (n, l), each of which
     depends on its own observation alone. Both are copied, so that it may do as it likes with them.
-    A torch module gets a tensor on its own device, in evaluation mode and without gradients. Where
-    there is no `encode`, it is called. `latent_size`, `decode`, `name` and `check_task` are used if
-    there are any.
 
     Args:
-        given: the user's object.
+        given: an object with `encode`, a fitted transformer of scikit-learn, or else something that
+            is called, such as a function or a torch module, which gets a tensor on its own device,
+            in evaluation mode and without gradients. `latent_size`, `decode`, `name` and
+            `check_task` are used if there are any.
         task: whose observations it reads.
-
-    Attributes:
-        given: the user's object.
     """
 
     kind = OWN
@@ -143,12 +132,6 @@ class OwnEncoder(BaseEncoder):
         self.fingerprint = hashlib.sha256(latents.tobytes()).hexdigest()
 
     @property
-    def is_module(self) -> bool:
-        """Whether it is a torch module."""
-        torch = sys.modules.get("torch")  # whoever has a module has imported it
-        return torch is not None and isinstance(self.given, torch.nn.Module)
-
-    @property
     def _probes(self) -> Float32:
         """Observations to try it on, (n, d)."""
         scaled = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, (_PROBES, self.size))
@@ -162,7 +145,7 @@ class OwnEncoder(BaseEncoder):
             raise InputError(f"{self.name} failed at its {name}: {_reason(error)}") from error
 
     def _check_repeats(self, latents: Float32) -> None:
-        """Make sure that the probes' latents (n, l) come again, in this batch and in another."""
+        """Refuse it unless the probes' latents (n, l) come again, in this batch and in another."""
         near = _SAME * np.abs(latents).max()
         for count, when in ((_PROBES, "the next time"), (1, "in a batch of one")):
             again = self._apply(self._encode, self._probes[:count], self.latent_size)
@@ -180,7 +163,6 @@ class OwnEncoder(BaseEncoder):
         return self._in_rows(self._decode, latent, self.latent_size, self.size)
 
     def check_task(self, task: Task) -> None:
-        """Ask its own `check_task`, if it has one, else compare the number of features."""
         if check := self._has("check_task"):
             with refusing(f"{self.name} refuses {task.name}", told=_reason):
                 check(task)
@@ -220,27 +202,16 @@ class OwnEncoder(BaseEncoder):
         return result
 
     def _call(self, function: Callable[..., Any], rows: Float32) -> Any:
-        if not self.is_module:
-            names, pandas = self._has("feature_names_in_"), sys.modules.get("pandas")
-            if function is self._encode and names is not None and pandas:
-                return function(pandas.DataFrame(rows, columns=names))  # as it was fitted
-            return function(rows)
-        import torch
-
-        like = floating(self.given)
-        with _evaluating(self.given), torch.no_grad():
-            return function(torch.from_numpy(rows).to(like.device, like.dtype))
-
-
-def floating(module: Any) -> Any:
-    """A floating tensor of a torch module, to make others like it; one by default if it has none.
-
-    Parameters come before buffers.
-    """
-    import torch
-
-    tensors = chain(module.parameters(), module.buffers())
-    return next((each for each in tensors if each.is_floating_point()), torch.empty(0))
+        torch, pandas = sys.modules.get("torch"), sys.modules.get("pandas")
+        if torch and isinstance(self.given, torch.nn.Module):
+            tensors = chain(self.given.parameters(), self.given.buffers())
+            like = next((t for t in tensors if t.is_floating_point()), torch.empty(0))
+            with _evaluating(self.given), torch.no_grad():
+                return function(torch.from_numpy(rows).to(like.device, like.dtype))
+        names = self._has("feature_names_in_")
+        if pandas and names is not None and function is self._encode:
+            return function(pandas.DataFrame(rows, columns=names))  # as it was fitted
+        return function(rows)
 
 
 @contextmanager
@@ -267,11 +238,7 @@ def _name(given: Any) -> str:
 
 
 def _as_array(result: Any) -> Float32:
-    """What an encoder returned as an array of its own.
-
-    Raises:
-        TypeError: it isn't one array.
-    """
+    """What an encoder returned as an array of its own."""
     if isinstance(result, (tuple, dict)):
         raise TypeError(f"it returned a {type(result).__name__} instead of one array")
     if hasattr(result, "detach"):

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import Encoder
-from jbrep.encoders.layers import Layer
+from jbrep.encoders.encoder import Encoder, Layers
 from jbrep.envs.task import Feature
 from jbrep.text import facts, table
 
@@ -13,12 +12,7 @@ _RECORDS = ("training", "data", "metrics", "versions")
 
 
 def describe(encoder: BaseEncoder, source: str) -> dict[str, Any]:
-    """An encoder's card as plain JSON; of a user's own, what is known.
-
-    Args:
-        encoder: the encoder.
-        source: where it was taken from, as `shipped.source_of` says it.
-    """
+    """An encoder's card as plain JSON, with its source, as `source_of` says it."""
     task = encoder.task
     told = {
         "name": encoder.name,
@@ -47,13 +41,7 @@ def describe(encoder: BaseEncoder, source: str) -> dict[str, Any]:
 
 
 def card(encoder: BaseEncoder, source: str, width: int) -> str:
-    """A few lines on an encoder; of a file, also the range of each feature, scaled to [-1, 1].
-
-    Args:
-        encoder: the encoder.
-        source: where it was taken from, as `shipped.source_of` says it.
-        width: columns to fit.
-    """
+    """A few lines on an encoder; of a file, also the range of each feature, scaled to [-1, 1]."""
     told = describe(encoder, source)
     lines = {
         "source": source,
@@ -84,8 +72,8 @@ def _read(encoder: Encoder) -> tuple[Feature, ...]:
     return encoder.scaler.features(encoder.task)
 
 
-def _layers(layers: tuple[Layer, ...]) -> list[dict[str, Any]]:
-    return [{"units": len(layer.bias), "activation": layer.activation} for layer in layers]
+def _layers(layers: Layers) -> list[dict[str, Any]]:
+    return [{"units": layer.units, "activation": layer.activation} for layer in layers]
 
 
 def _shape(size: int, layers: list[dict[str, Any]]) -> str:

@@ -1,25 +1,25 @@
-"""The encoder: from observations to latents and back, through dense layers."""
+"""The encoder: from observations to latents and back, through layers."""
 
-import re
-from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, Union
 
 import numpy as np
 
 from jbrep.coordinates import is_torch, library_of
 from jbrep.coordinates.nearest import nearest
 from jbrep.dataset import Scaler
-from jbrep.encoders.base import BaseEncoder, Float32, OwnEncoder
-from jbrep.encoders.header import IMPORTED, MAX_MAGNITUDE, EncoderHeader
-from jbrep.encoders.layers import ACTIVATIONS, MAX_UNITS, Layer, run
+from jbrep.encoders.base import BaseEncoder, Float32
+from jbrep.encoders.header import EncoderHeader
+from jbrep.encoders.layers import MAX_UNITS, Layer, check_tensor, run
 from jbrep.envs.task import Task, check_same
-from jbrep.errors import InputError, choose
+from jbrep.errors import InputError
 from jbrep.records import container
 
 if TYPE_CHECKING:
     from torch.nn import Module
 
-Layers = tuple[Layer, ...]
+    from jbrep.encoders.imported import Model  # imports onnx
+
+Layers = tuple[Union[Layer, "Model"], ...]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 
 
@@ -63,7 +63,8 @@ class Encoder(BaseEncoder):
     """An encoder with its decoder and the scaling that both expect.
 
     It takes observations in physical units, as data sets and environments give them, and applies
-    its own scaling. All arithmetic is float32.
+    its own scaling. All arithmetic is float32. A network that was trained elsewhere is one layer,
+    see `jbrep.encoders.imported`.
 
     Args:
         header: its kind, name, task and origin.
@@ -99,7 +100,7 @@ class Encoder(BaseEncoder):
             encoder=[layer.activation for layer in encoder],
             decoder=[layer.activation for layer in decoder],
         )
-        code = len(encoder[-1].bias) if encoder else scaler.size
+        code = encoder[-1].units if encoder else scaler.size
         self.kept = scaler.places(keep, self.task)
         self.latent_size = code + len(self.kept)
         self.can_decode = bool(decoder) or not encoder
@@ -110,13 +111,14 @@ class Encoder(BaseEncoder):
 
     def _check(self, keep: tuple[str, ...]) -> None:
         for name in ("low", "high"):
-            _check_tensor(name, getattr(self.scaler, name), (len(self.scaler.features(self.task)),))
+            check_tensor(name, getattr(self.scaler, name), (len(self.scaler.features(self.task)),))
         if keep and not self.encoder:
             raise InputError("features can pass around layers, where there are some")
         sizes = [self.scaler.size]
         for part in ("encoder", "decoder"):
             for i, layer in enumerate(getattr(self, part)):
-                sizes.append(_check_layer(f"{part}.{i}", layer, sizes[-1]))
+                layer.check(f"{part}.{i}", sizes[-1])
+                sizes.append(layer.units)
         if self.decoder and sizes[-1] != self.scaler.size:
             raise InputError(f"the last layer has {sizes[-1]} units, expected {self.scaler.size}")
         if max(sizes) > MAX_UNITS:
@@ -126,25 +128,21 @@ class Encoder(BaseEncoder):
     def from_torch(
         encoder: "Module", task: Task | str, decoder: "Module | None" = None, name: str = "own"
     ) -> "Encoder":
-        """An encoder with the layers of a torch module, which stays as it is.
-
-        The module must be a chain of dense layers and activations of jbrep, as nn.Sequential or in
-        a `forward` that torch.fx can trace, in evaluation: normalisation and any other affine maps
-        become part of the layers.
+        """An encoder that runs a torch module, exported as ONNX; the module stays as it is.
 
         Args:
-            encoder: takes observations (n, d) in physical units, gives latents (n, l). Its method
-                `encode` is used if it has one.
+            encoder: takes observations (n, d) in physical units, gives latents (n, l), whatever it
+                does between, as far as `torch.onnx.export` can follow it. Its method `encode` is
+                used if it has one.
             task: whose observations it reads, or that task's name.
             decoder: takes latents, gives observations; its method `decode` is used if it has one.
                 None for the `decode` of the encoder, or none.
             name: what tables will call it: lower-case letters, digits and hyphens.
         """
-        from jbrep.encoders.from_torch import layers_of  # imports torch
+        from jbrep.encoders.imported import of_modules  # imports onnx
         from jbrep.envs.description import as_task  # imports Gymnasium
 
-        known = as_task(task)
-        return imported(known, name, *layers_of(encoder, known, decoder), "torch")
+        return of_modules(encoder, as_task(task), decoder, name)
 
     def with_header(self, **changes: Any) -> "Encoder":
         """The same encoder with other values of some fields in its header."""
@@ -156,14 +154,14 @@ class Encoder(BaseEncoder):
         named = {"low": self.scaler.low, "high": self.scaler.high}
         for part in ("encoder", "decoder"):
             for i, layer in enumerate(getattr(self, part)):
-                named |= {f"{part}.{i}.weight": layer.weight, f"{part}.{i}.bias": layer.bias}
+                named |= {f"{part}.{i}.{n}": each for n, each in layer.tensors().items()}
         return named
 
     def encode(self, observation: Values) -> Values:
         """Encode observations (..., d) in physical units as latents (..., l).
 
-        A torch tensor gives a tensor on the same device, and gradients flow through; anything else
-        is converted to a NumPy array.
+        A torch tensor gives a tensor on the same device, and gradients flow through all layers but
+        ONNX models; anything else is converted to a NumPy array.
         """
         values, arrays = self._prepare(observation, self.size, "observations")
         return arrays.encode(values)
@@ -202,12 +200,12 @@ class Encoder(BaseEncoder):
             def move(array: Float32) -> Any:
                 return torch.tensor(array, device=device)
 
-            def move_all(layers: Layers) -> Layers:
-                return tuple(Layer(move(w), move(b), activation) for w, b, activation in layers)
-
             with torch.inference_mode(False):  # so that gradients can flow through them later
                 scaler = self.scaler.moved(move)
-                encoder, decoder = move_all(self.encoder), move_all(self.decoder)
+                encoder, decoder = (
+                    tuple(layer.moved(move) for layer in part)
+                    for part in (self.encoder, self.decoder)
+                )
             self._on[device] = Arrays(scaler, encoder, decoder, self.kept)
         return self._on[device]
 
@@ -220,59 +218,4 @@ class Encoder(BaseEncoder):
         return nearest(self.task, decoded, observation) if on_coordinates else decoded
 
     def check_task(self, task: Task) -> None:
-        """As for `BaseEncoder`; other arguments, such as another body of the robot, will do."""
-        check_same(task, self.task, self.name)
-
-
-def _check_layer(name: str, layer: Layer, inputs: int) -> int:
-    """Check a layer of so many inputs; its units."""
-    units = max(1, layer.weight.shape[0]) if np.ndim(layer.weight) == 2 else 1
-    _check_tensor(f"{name}.weight", layer.weight, (units, inputs))
-    _check_tensor(f"{name}.bias", layer.bias, (units,))
-    choose(layer.activation, ACTIVATIONS, "activation")
-    return units
-
-
-def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...]) -> None:
-    """Make sure that a tensor is of that shape, of float32, and finite."""
-    if tensor.shape != shape:
-        raise InputError(f"tensor {name} has shape {tensor.shape}, expected {shape}")
-    if tensor.dtype != np.float32:
-        raise InputError(f"tensor {name} has type {tensor.dtype}, expected float32")
-    if not (np.abs(tensor) < MAX_MAGNITUDE).all():
-        raise InputError(
-            f"tensor {name} holds a number that is not finite or not below {MAX_MAGNITUDE:g}"
-        )
-
-
-def imported(task: Task, name: str, encoder: Layers, decoder: Layers, package: str) -> Encoder:
-    """An encoder that was trained elsewhere, from layers that take physical units.
-
-    Args:
-        task: whose observations it reads.
-        name: what tables will call it: lower-case letters, digits and hyphens.
-        encoder: from d features to l units.
-        decoder: from l units to d features; empty if there is none.
-        package: that it comes from, such as torch.
-    """
-    versions = {each: version(each) for each in ("jbrep", "numpy", package)}
-    header = EncoderHeader(kind=IMPORTED, name=name, environment=task, versions=versions)
-    ones = np.ones(task.size, np.float32)
-    return Encoder(header, Scaler(-ones, ones), encoder, decoder)
-
-
-def as_file(encoder: BaseEncoder) -> BaseEncoder:
-    """The encoder that a file can hold, where a user's own is a module with such layers.
-
-    Its header has no versions: equal layers are the same encoder, whatever converted them.
-
-    Returns:
-        The same encoder where it isn't a user's own, or can't be converted.
-    """
-    if not isinstance(encoder, OwnEncoder) or not encoder.is_module:
-        return encoder
-    name = re.sub("[^a-z0-9]+", "-", encoder.name.lower()).strip("-") or "own"
-    try:
-        return Encoder.from_torch(encoder.given, encoder.task, name=name).with_header(versions={})
-    except InputError:
-        return encoder
+        check_same(task, self.task, self.name)  # other arguments, such as another body, will do

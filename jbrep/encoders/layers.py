@@ -1,36 +1,78 @@
 """Dense layers and their activations, for NumPy arrays and torch tensors alike."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jbrep.coordinates import is_torch
+from jbrep.errors import InputError, choose
 
 MAX_UNITS = 4096  # in a layer
+MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
 
+ONNX = "onnx"  # in place of an activation: a layer that is a model
 LAYER_NORM = "layer-norm"
 AVG_L1_NORM = "avg-l1-norm"
-WHOLE = frozenset((LAYER_NORM, AVG_L1_NORM))  # those that read all units of a layer at once
 LEAST_NORM = 1e-8  # that an average magnitude counts as
 EPSILON = 1e-5  # added to the variance in a layer norm
 _SATURATED = 10.0  # from where tanh in the approximate GELU is 1 in float64
 
 
 class Layer(NamedTuple):
-    """A dense layer: activation(values @ weight.T + bias)."""
+    """A dense layer: activation(values @ weight.T + bias), from (..., in) to (..., units)."""
 
-    weight: Any  # (out, in) float32
-    bias: Any  # (out,) float32
+    weight: Any  # (units, in) float32
+    bias: Any  # (units,) float32
     activation: str
 
+    def __call__(self, values: Any) -> Any:
+        return activate(self.activation, values @ self.weight.T + self.bias)
 
-def run(layers: tuple[Layer, ...], values: Any) -> Any:
-    """Pass values (..., in) through the layers, giving (..., out)."""
-    for weight, bias, activation in layers:
-        values = activate(activation, values @ weight.T + bias)
+    @property
+    def units(self) -> int:
+        return len(self.bias)
+
+    def moved(self, move: Callable[[Any], Any]) -> "Layer":
+        """The same with weight and bias as `move` makes them, such as torch tensors."""
+        return Layer(move(self.weight), move(self.bias), self.activation)
+
+    def tensors(self) -> dict[str, Any]:
+        """Its numbers, by their names in a file."""
+        return {"weight": self.weight, "bias": self.bias}
+
+    def check(self, name: str, inputs: int) -> None:
+        """Check the numbers of a layer of so many inputs."""
+        units = max(1, self.weight.shape[0]) if np.ndim(self.weight) == 2 else 1
+        check_tensor(f"{name}.weight", self.weight, (units, inputs))
+        check_tensor(f"{name}.bias", self.bias, (units,))
+        choose(self.activation, ACTIVATIONS, "activation")
+
+
+def dense(weight: Any, bias: Any, activation: str = "linear") -> Layer:
+    """A layer from float64."""
+    single = np.ascontiguousarray(weight, dtype=np.float32)
+    return Layer(single, np.asarray(bias, np.float32), activation)
+
+
+def check_tensor(name: str, tensor: Any, shape: tuple[int, ...]) -> None:
+    """Make sure that a tensor is of that shape, of float32, and finite."""
+    if tensor.shape != shape:
+        raise InputError(f"tensor {name} has shape {tensor.shape}, expected {shape}")
+    if tensor.dtype != np.float32:
+        raise InputError(f"tensor {name} has type {tensor.dtype}, expected float32")
+    if not (np.abs(tensor) < MAX_MAGNITUDE).all():
+        raise InputError(
+            f"tensor {name} holds a number that is not finite or not below {MAX_MAGNITUDE:g}"
+        )
+
+
+def run(layers: Iterable[Any], values: Any) -> Any:
+    """Pass values (..., in) through the layers, giving (..., units)."""
+    for layer in layers:
+        values = layer(values)
     return values
 
 

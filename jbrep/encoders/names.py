@@ -7,9 +7,7 @@ from msgspec import Meta
 
 from jbrep.records.record import converted
 
-Name = Annotated[
-    str, Meta(pattern=r"^[a-z0-9-]+\Z", title="lower-case letters, digits and hyphens")
-]
+Name = Annotated[str, Meta(pattern=r"^[a-z0-9-]+\Z")]
 _NAME = re.compile(r"(?P<stem>.+?)(-(?P<latent>[0-9]{1,9}))?(-s(?P<seed>[0-9]{1,9}))?", re.ASCII)
 
 

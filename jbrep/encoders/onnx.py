@@ -10,14 +10,15 @@ import numpy as np
 import onnx
 from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import ArrayLike
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, compose, helper, numpy_helper, version_converter
 
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.layers import AVG_L1_NORM, EPSILON, LAYER_NORM, LEAST_NORM
 from jbrep.records.storage import exists, make_folder, taken, write_new
 
 _OPSET, _IR_VERSION = 17, 8
-_LATER = 20, 9  # the same for models with GELU
+_LATER, _LATER_IR_VERSION = 20, 9  # of models with GELU, or with others in them
+_FLOAT = TensorProto.FLOAT
 _OPERATORS = {  # by NumPy's names
     **{
         name: name.capitalize()
@@ -30,15 +31,32 @@ _OPERATORS = {  # by NumPy's names
 
 
 class _Graph:
-    """Nodes and constants, in order, known by name."""
+    """Nodes and constants, in order, known by name; and what they need of ONNX."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
+        self.functions: list[onnx.FunctionProto] = []
+        self.opsets, self.ir_version = {"": _OPSET}, _IR_VERSION
+
+    def need(self, opsets: Mapping[str, int], ir_version: int) -> None:
+        """Need these versions of operators, by their domains, and of the format, or later ones."""
+        for domain, opset in opsets.items():
+            self.opsets[domain] = max(opset, self.opsets.get(domain, 0))
+        self.ir_version = max(self.ir_version, ir_version)
+
+    def add(self, model: onnx.ModelProto) -> None:
+        """Add all that a model is made of; its names must be others."""
+        self.nodes.extend(model.graph.node)
+        self.constants.extend(model.graph.initializer)
+        self.functions.extend(model.functions)
+        self.need({each.domain: each.version for each in model.opset_import}, model.ir_version)
 
     def node(self, operator: str, *inputs: Any, output: str = "", **attributes: Any) -> str:
         """Add an operation on values and constants; its output's name."""
         output = output or f"value_{len(self.nodes)}"
+        if operator == "Gelu":
+            self.need({"": _LATER}, _LATER_IR_VERSION)
         names = [each.name if isinstance(each, _Rows) else self._constant(each) for each in inputs]
         self.nodes.append(helper.make_node(operator, names, [output], output, **attributes))
         return output
@@ -63,6 +81,18 @@ class _Rows(NDArrayOperatorsMixin):
         """What an operation makes of values, as wide as this one unless another width is given."""
         name = self.graph.node(operator, *inputs, **attributes)
         return _Rows(self.graph, name, width or self.width)
+
+    def through(self, model: onnx.ModelProto, width: int) -> "_Rows":
+        """What another model makes of them, of that width; it becomes part of this one."""
+        opset = max(each.version for each in model.opset_import if each.domain in ("", "ai.onnx"))
+        if opset < _LATER:
+            model = version_converter.convert_version(model, _LATER)
+        part = compose.add_prefix(model, f"part_{len(self.graph.nodes)}/")
+        (given,), (made,) = part.graph.input, part.graph.output
+        kind = given.type.tensor_type.elem_type
+        self.graph.node("Cast", self, output=given.name, to=kind)
+        self.graph.add(part)
+        return self.made("Cast", _Rows(self.graph, made.name, width), width=width, to=_FLOAT)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         if ufunc is np.arctan2:
@@ -167,13 +197,12 @@ def traced(
     for output, rows in outputs(_Rows(graph, "observation", size)):
         graph.node("Identity", rows, output=output)
         described.append(_described(output, rows.width))
-    later = any(node.op_type == "Gelu" for node in graph.nodes)
-    opset, ir_version = _LATER if later else (_OPSET, _IR_VERSION)
     inputs = [_described("observation", size)]
     made = helper.make_model(
         helper.make_graph(graph.nodes, name, inputs, described, graph.constants),
-        opset_imports=[helper.make_opsetid("", opset)],
-        ir_version=ir_version,
+        functions=graph.functions,
+        opset_imports=[helper.make_opsetid(*each) for each in graph.opsets.items()],
+        ir_version=graph.ir_version,
         producer_name="jbrep",
     )
     helper.set_model_props(made, {"jbrep": json.dumps(metadata)})
@@ -182,4 +211,4 @@ def traced(
 
 
 def _described(name: str, size: int) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(name, TensorProto.FLOAT, ("rows", size))
+    return helper.make_tensor_value_info(name, _FLOAT, ("rows", size))

@@ -1,5 +1,6 @@
 """Encoders by name: those that ship with the package, and those that need no data."""
 
+import inspect
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,14 +13,13 @@ from jbrep.coordinates.invariance import tried_coordinates
 from jbrep.dataset import Scaler
 from jbrep.dataset.scaling import usual_range
 from jbrep.encoders.base import BaseEncoder, as_encoder
-from jbrep.encoders.code import make
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.file import SUFFIX, load
 from jbrep.encoders.header import FULL, HELD_OUT_MSE, EncoderHeader
 from jbrep.encoders.names import EncoderName
-from jbrep.envs.names import is_code
+from jbrep.envs.names import code_named, is_code
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, refusing
 from jbrep.records.storage import exists
 
 _FOLDER = Path(__file__).parent / "shipped"
@@ -41,28 +41,23 @@ def names(task: Task) -> tuple[str, ...]:
 
 
 def unlearned(task: Task, name: str = FULL) -> Encoder:
-    """The encoder that leaves a task's observation as it is, but for its scaling; or coordinates.
+    """A task's observation, or its coordinates or symmetry, by name, scaled as far as is known.
 
     The usual range of a number becomes [-1, 1]; one without keeps its physical units.
-
-    Args:
-        task: whose observations it reads.
-        name: full, coordinates or symmetry.
     """
     return _scaled(task, name, tried_coordinates(task, UNLEARNED[name]))
 
 
 def unscaled(task: Task) -> Encoder:
-    """The encoder that leaves a task's observation as it is, in physical units."""
+    """A task's observation as it is, in physical units."""
     header = EncoderHeader(
-        kind=FULL, name="observation", environment=task, training={}, metrics={HELD_OUT_MSE: 0.0}
+        kind=FULL, name="observation", environment=task, metrics={HELD_OUT_MSE: 0.0}
     )
     high = np.ones(task.size, np.float32)
-    return Encoder(header, Scaler(-high, high, None), (), ())
+    return Encoder(header, Scaler(-high, high), (), ())
 
 
 def _scaled(task: Task, name: str, coordinates: Coordinates | None) -> Encoder:
-    """The encoder that only scales, by usual ranges as far as they are known."""
     features = coordinates.features if coordinates else task.features
     ranges = [usual_range(feature) for feature in features]
     known = sum(each is not None for each in ranges)
@@ -79,10 +74,9 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
     """The encoder that ships for a task, or a task's name, under that name, or the one in a file.
 
     A shipped name takes precedence; write ./dae-8 for a file of that name. `full`, `coordinates`
-    and `symmetry` are there for every task whose features allow them: where none ships, they are
-    scaled by usual ranges, as far as there are any.
-    A name such as mymodule:MyEncoder is of code (see `jbrep.encoders.code`); anything but a name is
-    an encoder itself, or a user's own (see `jbrep.encoders.base.as_encoder`).
+    and `symmetry` are there for every task whose features allow them (see `unlearned`). A name such
+    as mymodule:MyEncoder is of code (see `make`); anything but a name is an encoder itself, or a
+    user's own (see `jbrep.encoders.base.OwnEncoder`).
     """
     if isinstance(task, str):
         from jbrep.envs.description import describe  # imports Gymnasium
@@ -99,13 +93,26 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
     return encoder
 
 
-def find_all(given: Any, task: Task) -> dict[str, BaseEncoder]:
-    """Encoders by what tables call them.
+def make(name: str | Path, task: Task) -> BaseEncoder:
+    """The encoder that code names: a class, or a function of no arguments, is called to make it."""
+    with refusing(f"can't make the encoder {name}"):
+        thing = code_named(str(name), "encoder")
+        makes = isinstance(thing, type)
+        if inspect.isfunction(thing):
+            needed = (
+                p for p in inspect.signature(thing).parameters.values() if p.default is p.empty
+            )
+            makes = all(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in needed)
+        if makes:
+            thing = thing()
+    return as_encoder(thing, task)
 
-    Args:
-        given: one, several, or several by names of the user's, each as `find` takes it. Otherwise
-            they have their own names, or where they are from, if a name is taken.
-        task: whose observations they read.
+
+def find_all(given: Any, task: Task) -> dict[str, BaseEncoder]:
+    """Encoders, one or several as `find` takes them, by what tables call them.
+
+    That is a name that the user gives in a dictionary, or else the encoder's own, or where it is
+    from if that is taken.
     """
     if isinstance(given, Mapping):
         return {label: find(each, task) for label, each in given.items()}
@@ -158,11 +165,7 @@ def find_alone(name: Any, task: Task | None) -> BaseEncoder:
 
 
 def source_of(name: str | Path, task: Task | None) -> str:
-    """Where `find` and `find_alone` take an encoder from.
-
-    Such as "dae-8, shipped"; "full, unscaled" where none ships; "mymodule:MyEncoder, code"; or a
-    file's path.
-    """
+    """Where `find` takes an encoder from: "dae-8, shipped", "full, unscaled" or a file's path."""
     if is_code(name):
         return f"{name}, code"
     if task and _is_made(name, task):
@@ -172,11 +175,7 @@ def source_of(name: str | Path, task: Task | None) -> str:
 
 
 def shipped(task: Task) -> dict[str, Encoder]:
-    """The encoders that ship for a task, by their names, the whole observation first.
-
-    Raises:
-        DamageError: a file is damaged.
-    """
+    """The encoders that ship for a task, by their names, the whole observation first."""
     files = _files(task)
     return {name: load(files[name]) for name in sorted(files, key=lambda name: name != FULL)}
 
@@ -192,9 +191,8 @@ def _is_made(name: str | Path, task: Task) -> bool:
         return False
     if (path := _files(task).get(str(name))) is None:
         return True
-    ships = load(path)
     try:
-        ships.check_task(task)
+        load(path).check_task(task)
     except InputError:
         return True
     return False

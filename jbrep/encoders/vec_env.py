@@ -25,9 +25,8 @@ def agent_spaces(task: Task, encoder: BaseEncoder | None) -> tuple[spaces.Box, s
 class JitterbugVecEnv(VecEnv):
     """Many lanes of a task for stable-baselines3, stepped together where that is possible.
 
-    Observations are float32, scaled by the task's usual ranges. With an encoder the agent sees
-    latents instead, terminal ones too; the encoder gets observations in physical units. Actions are
-    scaled to [-1, 1] from their bounds, whatever these are.
+    Observations are float32, scaled by the task's usual ranges, or else the latents of an encoder,
+    which gets them in physical units. Actions are scaled to [-1, 1] from their bounds.
 
     The first episode of lane i has the seed `seed + i`, as in a Gymnasium environment; episode k
     from 1 on has a number below 2^31 drawn from (seed + i, k), so that each episode can be played
@@ -37,9 +36,8 @@ class JitterbugVecEnv(VecEnv):
         task: a task, or the name or id of one.
         num_envs: the number of lanes.
         seed: of the first lane.
-        encoder: a `jbrep.encoders.Encoder`, or a user's own: an object with `encode`, a function,
-            or a torch module (see `jbrep.encoders.base.OwnEncoder`); None gives the full
-            observation.
+        encoder: a `jbrep.encoders.Encoder`, or a user's own (see `jbrep.encoders.base.OwnEncoder`);
+            None gives the full observation.
         num_threads: threads to step the lanes on; None takes one for each core.
         max_episode_steps: the time limit of a task given by its name [steps].
         action_repeat: control steps for which each action is held, fewer where an episode ends

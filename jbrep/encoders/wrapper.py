@@ -41,11 +41,9 @@ _NO_ARGUMENTS = {  # what `make` and `make_vec` take besides a task's own argume
 class Encoded:
     """An environment whose observations are an encoder's latents, terminal ones too.
 
-    It is a `gymnasium.Wrapper` of a single environment, a `gymnasium.vector.VectorWrapper` of a
-    vector environment. The encoder gets float32 observations in physical units, (n, d), flat in the
-    order of Gymnasium's `flatten`, less the task's offsets; of a vector environment all lanes at
-    once. Where a vector environment resets in the step that ends an episode, `infos["final_obs"]`
-    holds latents, too.
+    It is a `gymnasium.Wrapper`, or a `gymnasium.vector.VectorWrapper` of a vector environment,
+    whose `infos["final_obs"]` holds latents, too. The encoder gets float32 observations in physical
+    units, (n, d), flat in the order of Gymnasium's `flatten`, less the task's offsets.
 
     Args:
         env: the environment.
@@ -109,12 +107,10 @@ class EncodedEnv(Encoded, gymnasium.Wrapper[Float32, Any, Any, Any], RecordConst
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float32, dict[str, Any]]:
-        """Start an episode; its first latent, (l,)."""
         observation, info = self.env.reset(seed=seed, options=options)
         return self._latent(observation), info
 
     def step(self, action: Any) -> tuple[Float32, Any, bool, bool, dict[str, Any]]:
-        """Take a step; the latent of the new state, (l,)."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._latent(observation), reward, terminated, truncated, info
 
@@ -134,12 +130,10 @@ class EncodedVectorEnv(Encoded, VectorWrapper[Float32, Any, Any, Any, Any]):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Float32, dict[str, Any]]:
-        """Start episodes; the first latents, (n, l)."""
         observation, infos = self.env.reset(seed=seed, options=options)
         return self._encode(self._rows(observation)), infos
 
     def step(self, actions: Any) -> tuple[Float32, Any, Any, Any, dict[str, Any]]:
-        """Take a step in every lane; the latents, (n, l), also of `final_obs`."""
         observation, reward, terminated, truncated, infos = self.env.step(actions)
         if "final_obs" in infos:
             infos = {**infos, "final_obs": self._finals(infos["final_obs"], infos["_final_obs"])}

@@ -46,7 +46,7 @@ class AutoresetLanes:
     Args:
         task: whose environment is made.
         num_lanes: n.
-        num_threads: as for `Lanes`.
+        num_threads: threads to step a batch on.
         repeat: steps for which each action is held; fewer where an episode ends before.
         retries: of failures, each of which ends an episode, truncated, before the step that failed.
 
@@ -65,9 +65,11 @@ class AutoresetLanes:
         if repeat < 1:
             raise InputError(f"the action repeat is {repeat}: it must be at least 1")
         self.lanes = Lanes(task, num_lanes, num_threads, Retries(retries))
-        self._repeat = repeat
+        self._repeat, self._size = repeat, task.action_size
         self._seeds = np.zeros(num_lanes, np.int64)
         self._episodes = np.zeros(num_lanes, np.int64)  # k of each lane's episode
+        self._taken: list[Array] = []  # actions since the oldest episode of now began, (n, k) each
+        self._begun = np.zeros(num_lanes, np.int64)  # how many of them came before each episode
 
     def reset(self, seeds: Sequence[int | None]) -> Array:
         """Start the first episode of a lane's new seed, or its next one; observations (n, d)."""
@@ -84,9 +86,10 @@ class AutoresetLanes:
     def step(self, actions: Array) -> AutoresetStep:
         """Hold an action in every lane for its steps; actions (n, k)."""
         before = self.lanes.steps
+        self._taken.append(actions)
         step, reward, non_finite = self._hold(actions)
         lost = self.lanes.steps == before
-        ended, observation, length = self.lanes.ended, step.observation, self.lanes.steps
+        ended, observation, length = ~self.lanes.active, step.observation, self.lanes.steps
         if ended.any():
             numbers = np.flatnonzero(ended).tolist()
             self._episodes[numbers] += 1
@@ -111,20 +114,42 @@ class AutoresetLanes:
 
     @property
     def state(self) -> State:
-        """A copy of what `restore` takes: everything that decides how the lanes continue."""
-        own = {"first_seeds": self._seeds.copy(), "episodes": self._episodes.copy()}
-        return own | self.lanes.state
+        """What `restore` takes: the episodes of now, by their seeds and actions."""
+        return {
+            "first_seeds": self._seeds.copy(),
+            "episodes": self._episodes.copy(),
+            "begun": self._begun.copy(),
+            "actions": np.array(self._taken).reshape(-1, *self._begun.shape, self._size),
+            "observation": self.lanes.observation.copy(),
+        }
 
     def restore(self, state: State) -> None:
-        """Continue from where the state was taken, to the same bits."""
-        lanes = dict(state)
-        self._seeds = lanes.pop("first_seeds").copy()
-        self._episodes = lanes.pop("episodes").copy()
-        self.lanes.restore(lanes)
+        """Play the episodes of a state again, to the same bits, and continue from there."""
+        self._seeds, self._episodes = state["first_seeds"].copy(), state["episodes"].copy()
+        actions, begun = state["actions"], state["begun"].copy()
+        self.lanes.abandon()
+        for number in range(len(actions) + 1):
+            if len(begin := np.flatnonzero(begun == number)):
+                self.lanes.reset(begin.tolist(), self._seeds_of(begin.tolist()))
+            if number < len(actions):
+                self._hold(actions[number])
+        self._taken, self._begun = [*actions], begun
+        if self.lanes.observation.tobytes() != state["observation"].tobytes():
+            raise InputError(
+                f"{self.lanes.task.name} is not reproducible here, or another than it was: the "
+                "same seed and actions lead to another state, so this can't continue where it "
+                "stopped"
+            )
 
     def _start(self, lanes: Sequence[int]) -> Array:
-        seeds = [_episode_seed(int(self._seeds[i]), int(self._episodes[i])) for i in lanes]
-        return self.lanes.reset(lanes, seeds)
+        self._begun[lanes] = len(self._taken)
+        oldest = int(self._begun.min())
+        del self._taken[:oldest]
+        self._begun -= oldest
+        return self.lanes.reset(lanes, self._seeds_of(lanes))
+
+    def _seeds_of(self, lanes: Sequence[int]) -> list[int]:
+        return [_episode_seed(int(self._seeds[i]), int(self._episodes[i])) for i in lanes]
 
 
 def _episode_seed(first: int, episode: int) -> int:

@@ -1,13 +1,16 @@
-"""A batch of environments whose sensors, motors, bodies and physics each episode draws."""
+"""Environments whose sensors, motors, bodies and physics each episode draws."""
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.envs.domain import Drawn, Draws
-from jbrep.envs.separate import not_the_same
+from jbrep.envs.domain import Domain, Drawn, Draws
+from jbrep.envs.physics import FRICTIONS, MASSES, physics_of, put_factors, velocity_after
 from jbrep.envs.task import Array, Task
 
 _OPTIONS = ("friction", "mass", "body")  # of a batch that has them, when it is reset
@@ -47,7 +50,6 @@ class Disturbed:
         return getattr(self._batch, name)
 
     def reset(self, seed: Any, options: Mapping[str, Any]) -> tuple[Array, Any]:
-        """As the batch does."""
         lanes = np.flatnonzero(options["reset_mask"])
         seeds = np.array([seed[lane] for lane in lanes], np.int64)
         self._draws.begin(lanes, seeds)
@@ -66,7 +68,6 @@ class Disturbed:
                 self._drawn[name][lane] = 0 if value is None else value
 
     def step(self, actions: Array) -> tuple[Any, ...]:
-        """As the batch does; of a step that is lost nothing is seen."""
         self._draws.move()
         if self._push and (pushes := self._draws.pushes(self._drawn["push"])).any():
             self._push(pushes)
@@ -93,32 +94,65 @@ class Disturbed:
         """Those of so many steps before, (n, ...), as the episode has drawn."""
         return values[np.arange(len(values)), self._drawn[name].astype(np.int64)]
 
-    @property
-    def state(self) -> dict[str, Any]:
-        """A copy of what `restore` takes."""
-        own = {
-            "domain_given": self._given,
-            "domain_measured": self._measured,
-            "domain_commands": self._commands,
-            "domain_shown": self._shown,
-        }
-        copies = {name: values.copy() for name, values in own.items()}
-        return copies | self._draws.state | self._batch.state
-
-    def restore(self, state: Mapping[str, Any]) -> tuple[Array, Any]:
-        """As the batch does."""
-        own = {name: each for name, each in state.items() if name.startswith("domain_")}
-        given, info = self._batch.restore({n: v for n, v in state.items() if n not in own})
-        if given.tobytes() != own["domain_given"].tobytes():
-            raise not_the_same(self._task)
-        self._given, self._shown = given, own["domain_shown"].copy()
-        self._measured[:], self._commands[:] = own["domain_measured"], own["domain_commands"]
-        self._draws.restore(own)
-        self._draw(np.arange(len(given)), own["domain_seeds"])
-        return self._shown.copy(), info
-
 
 def _put_first(values: Array, newest: Array) -> None:
     """Put the newest (n, ...) before those of earlier steps, (n, k, ...); the oldest goes."""
     values[:, 1:] = values[:, :-1].copy()
     values[:, 0] = newest
+
+
+class Varied(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment with MuJoCo, whose friction, masses and pushes each episode draws.
+
+    Frictions and masses that the environment itself sets in its reset are multiplied likewise.
+
+    Args:
+        env: the environment.
+        domain: from which it draws.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], domain: Domain):
+        super().__init__(env)
+        self._domain, self._draws = domain, Draws(1, 0)
+        self._model: Any = None
+        self._speed = np.zeros(1)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start the episode with that seed."""
+        assert seed is not None
+        drawn = self._domain.draw(seed)
+        self._speed[:] = drawn.push
+        self._draws.begin(np.array([0]), np.array([seed]))
+        self._vary(drawn.friction, drawn.mass)
+        put = {name: getattr(self._model, name).copy() for name in (*FRICTIONS, *MASSES)}
+        given = self.env.reset(seed=seed, options=options)
+        self._keep(put)
+        self._vary(drawn.friction, drawn.mass)  # it may have another model now
+        return given
+
+    def _keep(self, put: dict[str, Array]) -> None:
+        """Take the numbers that the environment changed since they were put there as the usual."""
+        for name, before in put.items():
+            now, usual = getattr(self._model, name), getattr(self._usual, name)
+            usual[:] = np.where(now == before, usual, now)
+
+    def _vary(self, friction: float, mass: float) -> None:
+        physics = physics_of(self.env)
+        assert physics  # as `jbrep.envs.description.changeable` has seen
+        if physics.model is not self._model:
+            self._model, self._usual = physics.model, copy.copy(physics.model)
+            self._data = mujoco.MjData(self._usual)
+        put_factors(self._model, self._usual, friction, mass, self._data)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step, after a push if there is one."""
+        self._draws.move()
+        (push,) = self._draws.pushes(self._speed)
+        if push.any():
+            physics = physics_of(self.env)
+            assert physics
+            now = physics.data.qpos
+            physics.data.qvel[:] += velocity_after(physics.model, now, push, self._data)
+        return self.env.step(action)

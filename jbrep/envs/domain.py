@@ -1,6 +1,5 @@
 """What differs from episode to episode: the robot's body and physics, its sensors and motors."""
 
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 
@@ -8,9 +7,8 @@ import numpy as np
 from msgspec import Meta, structs
 from numpy.typing import NDArray
 
-from jbrep.errors import InputError
-from jbrep.records.record import Finite, Record, converted, shown
-from jbrep.records.words import bare, must_be, type_of
+from jbrep.errors import InputError, choose
+from jbrep.records.record import Finite, Record, converted
 
 Array = NDArray[np.float64]
 
@@ -18,7 +16,6 @@ _STREAM = 0x646F6D61696E  # nothing else draws from the streams (_STREAM, seed, 
 _BLOCK = 100  # steps whose numbers are drawn at once
 _PUSHES = 0.01  # in a step, on average
 _LATEST = 100  # [steps]
-_WHOLE = re.compile(r"\d+", re.ASCII)
 
 _Positive = Annotated[float, Meta(ge=0, le=1000)]
 _Factor = Annotated[float, Meta(ge=0.01, le=100)]
@@ -101,7 +98,8 @@ class Domain(Record, frozen=True):
     @property
     def _differing(self) -> dict[str, Any]:
         """The ranges by name that aren't those of no domain at all."""
-        usual, own = Domain(), {name: getattr(self, name) for name in NAMES}
+        usual = Domain()
+        own = {name: getattr(self, name) for name in NAMES}
         return {name: ends for name, ends in own.items() if ends != getattr(usual, name)}
 
 
@@ -118,31 +116,13 @@ def _between(ends: Any, at: float) -> Any:
 def read_ranges(given: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a domain from numbers and ranges as people write them: 2, "0..3" or [0, 3]."""
     kinds = {field.name: field.type for field in structs.fields(Domain) if field.name in NAMES}
-    ranges, names = {}, ", ".join(NAMES)
+    ranges = {}
     for name, value in given.items():
-        if name not in kinds:
-            raise InputError(f"unknown {shown(name)} in a domain: it must be one of {names}")
-        pair = value if isinstance(value, list) else _ends(value)
-        try:
-            ranges[name] = converted(pair, kinds[name], name)
-        except InputError:
-            node: Any = bare(type_of(kinds[name]))
-            number = must_be(node.item_types[0])
-            raise InputError(
-                f"{name} is {shown(value)}: it must be {number}, or a range, as in 1..2"
-            ) from None
+        kind = choose(name, kinds, "part of a domain")
+        ends = [*map(str.strip, value.split(".."))] if isinstance(value, str) else value
+        ends = ends if isinstance(ends, list) else [ends]
+        ranges[name] = converted(ends * 2 if len(ends) == 1 else ends, kind, name, strict=False)
     return ranges
-
-
-def _ends(value: Any) -> list[Any]:
-    """The ends of a range, or of a number alone; text that is none of these as it is."""
-    if not isinstance(value, str):
-        return [value] * 2
-    ends = value.split("..", 1) if ".." in value else [value] * 2
-    try:
-        return [int(each) if _WHOLE.fullmatch(each.strip()) else float(each) for each in ends]
-    except ValueError:
-        return ends
 
 
 class Draws:
@@ -201,13 +181,3 @@ class Draws:
 
     def _now(self, block: Array) -> Array:
         return block[np.arange(len(block)), self._steps % _BLOCK]
-
-    @property
-    def state(self) -> dict[str, NDArray[np.int64]]:
-        """A copy of what `restore` takes."""
-        return {"domain_seeds": self._seeds.copy(), "domain_steps": self._steps.copy()}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Be where the state was taken."""
-        self._seeds[:], self._steps[:] = state["domain_seeds"], state["domain_steps"]
-        self._fill(np.arange(len(self._seeds)))

@@ -8,25 +8,20 @@ end, whatever happens.
 import atexit
 import warnings
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 import gymnasium
 from gymnasium.wrappers import TimeLimit
 
+from jbrep.envs.disturbed import Varied
 from jbrep.envs.domain import Domain
-from jbrep.envs.make import aside, is_batched, make_env
-from jbrep.envs.names import find_spec
-from jbrep.envs.origin import files_of
-from jbrep.envs.task import Task
-from jbrep.envs.varied import Varied
-from jbrep.errors import InputError, Notice, kind_and_line
-from jbrep.machine import own_memory
+from jbrep.envs.make import aside, make_env
+from jbrep.envs.names import files_of, find_spec
+from jbrep.errors import Notice, kind_and_line
 
 Env = gymnasium.Env[Any, Any]
 _Key = tuple[Any, ...]
 _NO_LIMIT = -1  # as gymnasium.make takes it
-_MEASURED = 3  # environments, to see what memory each takes
 
 
 class _Instance(NamedTuple):
@@ -97,24 +92,6 @@ def close_kept() -> None:
     """Close what nobody uses, so that another process can have it."""
     while _kept:
         _close(_kept.pop().env)
-
-
-def memory_of_each(task: Task) -> int:
-    """Bytes that each environment of a task takes, as a few of them show.
-
-    0 where a batch steps all of them, which takes little, where a robot may exist once, and where
-    the environment can't be made.
-    """
-    if is_batched(task) or not task.reproducible:
-        return 0
-    used, taken = list[Env](), list[int]()
-    with suppress(InputError):
-        for _ in range(1 + _MEASURED):  # with the first one, modules are loaded
-            used.append(take(task.id, task.arguments, task.max_episode_steps))
-            taken.append(own_memory())
-    for env in used:
-        give_back(env)
-    return max(0, taken[-1] - taken[0]) // _MEASURED if len(taken) > _MEASURED else 0
 
 
 @atexit.register

@@ -13,7 +13,7 @@ from jbrep.envs.make import is_batched, make_batch
 from jbrep.envs.separate import EnvironmentFailedError as EnvironmentFailedError
 from jbrep.envs.separate import Flags as Flags
 from jbrep.envs.separate import Retries as Retries
-from jbrep.envs.separate import Separate, not_the_same
+from jbrep.envs.separate import Separate
 from jbrep.envs.separate import State as State
 from jbrep.envs.task import Array, Task
 from jbrep.envs.view import Seen
@@ -32,14 +32,7 @@ def check_counts(num_lanes: int, num_threads: int | None) -> None:
 
 
 def lanes_at_once(task: Task, most: int, threads: int | None, retries: int) -> "Lanes":
-    """As many lanes as there may be, or one, of a robot that exists once.
-
-    Args:
-        task: whose environment is made.
-        most: lanes.
-        threads: to step a batch on.
-        retries: as `Retries` takes them.
-    """
+    """At most so many lanes as there may be: one of a robot that exists once."""
     try:
         return Lanes(task, most, threads, Retries(retries))
     except InputError:
@@ -49,11 +42,7 @@ def lanes_at_once(task: Task, most: int, threads: int | None, retries: int) -> "
 
 
 def check_actions(actions: ArrayLike, num_lanes: int, size: int) -> NDArray[np.float64]:
-    """The actions as (num_lanes, size) float64.
-
-    Raises:
-        NonFiniteActionError: a value that is not finite.
-    """
+    """The actions as (num_lanes, size) float64, all finite."""
     checked: NDArray[np.float64] = np.asarray(actions, dtype=np.float64)
     if checked.shape != (num_lanes, size):
         raise InputError(
@@ -89,17 +78,14 @@ class Lanes:
             that failed; by default none.
 
     Attributes:
-        task: the task.
-        num_lanes: n.
         observation: the current one of each lane, (n, d) in physical units.
         arrays: the current ones of the task's `state` and `constants`, (n, width) each.
         info: all that a batch tells of its lanes, by name, (n, ...) each.
         terminated, truncated: how each lane's episode has ended, (n,).
-        active: whether it goes on, (n,).
+        active: whether it goes on, (n,); num_active: in how many lanes it does.
         lost: whether the last step led to nothing that can be used, (n,): it doesn't count, and its
             episode ended before it, truncated.
         missing: readings that were missing in each lane's episode, (n,).
-        num_active: in how many lanes it does.
         envs: the environments themselves: a batch, or one for each lane.
     """
 
@@ -141,11 +127,6 @@ class Lanes:
         return f"Lanes({self.task.name}, {self.num_lanes:,})"
 
     @property
-    def ended(self) -> Flags:
-        """Whether each lane's episode has ended, (n,)."""
-        return ~self.active
-
-    @property
     def has_failed(self) -> bool:
         """Whether an environment failed in an episode of now, which ended early thereby."""
         return bool(np.any(getattr(self._batch, "failed", False)))
@@ -180,13 +161,7 @@ class Lanes:
         return observation
 
     def step(self, actions: ArrayLike) -> Step:
-        """Take one step in every lane whose episode goes on.
-
-        Raises:
-            NonFiniteActionError: actions that are not finite.
-            EnvironmentFailedError: the environment raises an error, or gives a number that isn't
-                finite; the message has the lane's seed and step.
-        """
+        """Take one step in every lane whose episode goes on; actions (n, k)."""
         checked = check_actions(actions, self.num_lanes, self.task.action_size)
         active = self.active
         self._steps += active
@@ -216,30 +191,10 @@ class Lanes:
         """What the environment of each lane draws, as its `render_mode` says."""
         return self._batch.render()
 
-    @property
-    def state(self) -> State:
-        """A copy of what `restore` takes."""
-        own = {
-            "seeds": self._seeds.copy(),
-            "steps": self._steps.copy(),
-            "terminated": self.terminated.copy(),
-            "truncated": self.truncated.copy(),
-            "observation": self.observation.copy(),
-        }
-        return own | self._batch.state
-
-    def restore(self, state: State) -> None:
-        """Continue from where the state was taken, to the same bits."""
-        batch = dict(state)
-        self._seeds, self._steps = batch.pop("seeds").copy(), batch.pop("steps").copy()
-        self.terminated, self.truncated = batch.pop("terminated"), batch.pop("truncated")
+    def abandon(self) -> None:
+        """Leave all episodes as if they had ended."""
+        self.terminated = np.ones(self.num_lanes, dtype=np.bool_)
         self._count()
-        expected = batch.pop("observation")
-        observation, info = self._batch.restore(batch)
-        observation = np.where(self.active[:, None], observation, expected)
-        if observation.tobytes() != expected.astype(np.float64).tobytes():
-            raise not_the_same(self.task)
-        self._see(observation, info)
 
     def close(self) -> None:
         """Free what the environments hold; a separate one is kept for the next who needs it."""
@@ -269,6 +224,5 @@ class Lanes:
         lane = int(np.flatnonzero(~good)[0])
         raise EnvironmentFailedError(
             f"{self.task.name} {did} an observation or reward that is not finite, at step "
-            f"{self._steps[lane]} of the episode with seed {self._seeds[lane]}",
-            lane,
+            f"{self._steps[lane]} of the episode with seed {self._seeds[lane]}"
         )

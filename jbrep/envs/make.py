@@ -5,7 +5,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jbrep.envs.names import find_spec, spec_of
 from jbrep.envs.task import Task
-from jbrep.errors import kind_and_line, refusing
+from jbrep.errors import refusing
 
 Flatten = Callable[[Any], NDArray[Any]]
 
@@ -59,18 +59,18 @@ def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv
 def _making(env_id: str, arguments: Mapping[str, Any]) -> Iterator[None]:
     """Say in a line why an environment can't be made."""
     given = f" with {dict(arguments)}" if arguments else ""
-    with refusing(f"can't make {env_id}{given}", told=reason), _quiet(), aside():
+    with refusing(f"can't make {env_id}{given}"), _quiet(), aside():
         yield
 
 
 def is_batched(task: Task) -> bool:
     """Whether the environment steps many lanes faster together than one by one.
 
-    That is so if the registered vector entry point is a class that can take and restore its state:
-    one with the attributes `state` and `restore`, and with the arguments num_threads, dtype and
-    autoreset_mode.
+    That is so if the registered vector entry point is a class that says so: one with a true
+    attribute `resets_lanes`, the arguments num_threads, dtype and autoreset_mode, and a `reset`
+    that takes the option `reset_mask`.
     """
-    return hasattr(creator(spec_of(task), vector=True), "restore")
+    return getattr(creator(spec_of(task), vector=True), "resets_lanes", False)
 
 
 def is_one_robot(task: Task, threads: int | None) -> bool:
@@ -103,45 +103,10 @@ def action_in(space: Any, values: Any) -> NDArray[Any]:
 
 
 def of_size(flat: NDArray[Any], size: int) -> NDArray[Any]:
-    """An observation, flat, that has so many numbers.
-
-    Raises:
-        ValueError: it has more or fewer.
-    """
+    """An observation, flat, that has so many numbers, or a ValueError."""
     if flat.shape != (size,):
         raise ValueError(f"it gave an observation of {flat.size} numbers instead of {size}")
     return flat
-
-
-class Step(NamedTuple):
-    """What an environment gives."""
-
-    observation: NDArray[Any]  # flat, (d,)
-    reward: float
-    terminated: bool
-    truncated: bool
-
-
-def random_play(env: gymnasium.Env[Any, Any], seed: int, most: int) -> Iterator[Step]:
-    """The first observation of an episode, and up to so many steps under random actions.
-
-    Raises:
-        ValueError: what it gives doesn't fit its spaces.
-    """
-    random, flat = np.random.default_rng(seed), flattener(env.observation_space)
-    space: Any = env.action_space
-    size = spaces.utils.flatdim(env.observation_space)
-    observation, info = env.reset(seed=seed)
-    if not isinstance(info, Mapping):
-        raise ValueError("too many values to unpack (expected 2")  # old Gym's
-    yield Step(of_size(np.array(flat(observation)), size), 0.0, False, False)
-    for _ in range(most):
-        action = action_in(space, random.uniform(space.low, space.high))
-        observation, reward, terminated, truncated, _ = env.step(action)
-        ends = bool(number(terminated, "terminated")), bool(number(truncated, "truncated"))
-        yield Step(of_size(np.array(flat(observation)), size), number(reward, "reward"), *ends)
-        if any(ends):
-            break
 
 
 def aside() -> redirect_stdout[Any]:
@@ -149,31 +114,8 @@ def aside() -> redirect_stdout[Any]:
     return redirect_stdout(sys.stderr)
 
 
-_OF_OLD_GYM = {  # what Gymnasium's wrappers, or Python, say of environments of that kind
-    "not enough values to unpack (expected 5, got 4)": "its step gives four values: it must give "
-    "five: observation, reward, terminated, truncated and info",
-    "too many values to unpack (expected 2": "its reset gives an observation alone: it must give "
-    "observation and info",
-    "reset() got an unexpected keyword argument": "its reset takes no seed and options: it must be "
-    "reset(self, *, seed=None, options=None)",
-}
-
-
-def reason(error: Exception) -> str:
-    """What an error of an environment says, for a message; of an old Gym's, what is to be done."""
-    told = kind_and_line(error)
-    for sign, advice in _OF_OLD_GYM.items():
-        if sign in told:
-            return f"{advice}, as in Gymnasium; this is old Gym's"
-    return told
-
-
 def number(value: Any, what: str) -> float:
-    """One number that an environment gives, which may stand in an array by itself.
-
-    Raises:
-        ValueError: several numbers, or none.
-    """
+    """One number that an environment gives, which may stand in an array, or a ValueError."""
     if isinstance(value, float | int):
         return float(value)
     values = np.asarray(value)

@@ -1,10 +1,14 @@
-"""Names of tasks: every id in Gymnasium's registry, and short names for some of them."""
+"""What names stand for: tasks in Gymnasium's registry, modules, code, a robot's own files."""
 
 import difflib
+import hashlib
+import os
 import re
 import shlex
 import sys
+import sysconfig
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import cache
 from importlib import import_module, metadata
 from operator import attrgetter
@@ -17,8 +21,13 @@ from gymnasium.envs.registration import EnvSpec
 
 from jbrep.envs.task import SHORT_NAMES, Task
 from jbrep.errors import InputError, kind_and_line, refusing
+from jbrep.records.storage import read_file
 
 _CODE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", re.ASCII)
+_INSTALLED = (  # packages, whose versions stand for their code
+    *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")),
+    Path(__file__).resolve().parents[1],
+)
 _imported: list[str] = []
 
 
@@ -47,32 +56,22 @@ def find_spec(name: str) -> EnvSpec:
 
 
 def spec_of(task: Task) -> EnvSpec:
-    """What is registered under a task's id.
-
-    Raises:
-        InputError, ModuleNotFoundError: as `find_spec`; the message names the module that the task
-            was defined in.
-    """
+    """What is registered under a task's id."""
     try:
         return find_spec(task.id)
     except InputError:
-        if not (modules := modules_of(task)):
-            raise
-        which = (
-            f"--import {shlex.quote(min(modules))}"
-            if len(modules) == 1
-            else "the one that registers it"
-        )
-        raise InputError(
-            f"unknown task {task.id!r}: it was made by {', '.join(modules)}; add {which}"
-            f"{'' if len(modules) == 1 else ', as --import MODULE'}: this runs its code"
-        ) from None
+        for module in modules_of(task):
+            raise InputError(
+                f"unknown task {task.id!r}: {module} defines it; add --import "
+                f"{shlex.quote(module)}, or the module that registers it: this runs its code"
+            ) from None
+        raise
 
 
 def modules_of(task: Task) -> list[str]:
-    """The user's own modules that a task was made by; none where packages have it."""
-    parts = [part.partition(" ") for part in task.made_from or ()]
-    return [*dict.fromkeys(name.split(".")[0] for kind, _, name in parts if kind == "module")]
+    """The user's module that defines a task's environment, in a list; empty if a package does."""
+    parts = [part.partition(" ") for part in task.files or ()]
+    return [name for kind, _, name in parts if kind == "module"]
 
 
 def import_modules(modules: Iterable[str]) -> None:
@@ -176,3 +175,43 @@ def _import_shimmy() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import_module("shimmy")
+
+
+# a robot's own files
+
+
+def absolute(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments in which the files and folders that they name are absolute paths."""
+    return {name: str(_path(value) or "") or value for name, value in arguments.items()}
+
+
+def files_of(arguments: Mapping[str, Any]) -> dict[str, str]:
+    """SHA-256 of the files that arguments name, such as a model, by the arguments' names."""
+    paths = {name: _path(value) for name, value in arguments.items()}
+    return {name: _digest(path) for name, path in paths.items() if path and path.is_file()}
+
+
+def code_of(maker: Any) -> dict[str, str]:
+    """SHA-256 of the user's file that defines a class or function, by the name of its module."""
+    name = getattr(getattr(maker, "func", maker), "__module__", "")  # of a partial function, too
+    file = getattr(sys.modules.get(name), "__file__", None)
+    path = Path(file).resolve() if file and name != "__main__" else None
+    if path is None or not path.is_file() or any(each in path.parents for each in _INSTALLED):
+        return {}
+    return {f"module {name}": _digest(path)}
+
+
+def _path(value: Any) -> Path | None:
+    """The file that text names, by a separator or a suffix, or the folder, by a separator."""
+    if not isinstance(value, str):
+        return None
+    has_separator = "/" in value or os.sep in value
+    with suppress(OSError, ValueError, RuntimeError):
+        path = Path(os.path.abspath(Path(value).expanduser()))  # noqa: PTH100 - without ".."
+        if (path.is_file() and (has_separator or path.suffix)) or (has_separator and path.is_dir()):
+            return path
+    return None
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(read_file(path)).hexdigest()

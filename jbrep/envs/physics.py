@@ -1,18 +1,180 @@
-"""MuJoCo behind an environment: its model and data, and what its state goes through."""
+"""MuJoCo behind an environment: its model and state, and how to turn, vary and push its robot."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import gymnasium
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
-from jbrep.envs.lanes import Lanes
-from jbrep.envs.mujoco import physics_of
-from jbrep.envs.recording import Recording
 from jbrep.envs.task import Array
 
+if TYPE_CHECKING:
+    from jbrep.envs.lanes import Lanes
+    from jbrep.envs.recording import Recording
+
+FRICTIONS, MASSES = ("geom_friction", "pair_friction"), ("body_mass", "body_inertia")
 # of an MjData: what a picture and the contact forces of a state follow from
 _STATE = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
+
+
+class Physics(NamedTuple):
+    """An environment's model and state."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+
+
+def physics_of(env: Any) -> Physics | None:
+    """The simulation behind one of Gymnasium's environments; None if it isn't MuJoCo's.
+
+    Known are those of Gymnasium and others like them, which have `model` and `data`, and those of
+    dm_control behind shimmy.
+    """
+    base = env.unwrapped
+    for owner in (base, getattr(getattr(base, "_env", None), "physics", None)):
+        model, data = (getattr(owner, name, None) for name in ("model", "data"))
+        model, data = (getattr(part, "ptr", part) for part in (model, data))  # dm_control wraps
+        if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+            return Physics(model, data)
+    return None
+
+
+def root_of(model: mujoco.MjModel) -> int:
+    """The body that carries the heaviest tree of those that can move; 0 where none can."""
+    roots = model.body_rootid[model.body_dofnum > 0].tolist()
+    return max(roots, key=lambda body: float(model.body_subtreemass[body]), default=0)
+
+
+def free_joints(model: mujoco.MjModel) -> list[int]:
+    """The joints of free bodies."""
+    free: list[int] = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).tolist()
+    return free
+
+
+def robot_joint(model: mujoco.MjModel) -> int | None:
+    """The joint by which the robot is free, if it is: it is the heaviest tree."""
+    root = root_of(model)
+    return next((each for each in free_joints(model) if model.jnt_bodyid[each] == root), None)
+
+
+def planar_root(model: mujoco.MjModel) -> tuple[int, int, int] | None:
+    """The joints by which a body moves along the world's x and y and turns about z."""
+    root, unturned = root_of(model), (1, 0, 0, 0)
+    for body in sorted(range(1, model.nbody), key=lambda body: body != root):
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        if model.body_parentid[body] or count < 3:
+            continue
+        if not np.array_equal(model.body_quat[body], unturned):
+            continue
+        kinds = model.jnt_type[first : first + 3].tolist()
+        slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+        axes = model.jnt_axis[first : first + 3]
+        if kinds == [slide, slide, hinge] and np.array_equal(axes, np.eye(3)):
+            return first, first + 1, first + 2
+    return None
+
+
+def quarter_turn(env: gymnasium.Env[Any, Any], shift: tuple[float, float]) -> bool:
+    """Turn a robot by a quarter about the world's vertical axis, then shift it [m].
+
+    An environment whose targets move with the robot has a method of that name. A quarter, since
+    MuJoCo's pyramidal friction cones are the same along both axes only.
+
+    Returns:
+        Whether it could be done: only where one body is free, or one moves in the plane.
+    """
+    if own := getattr(env.unwrapped, "quarter_turn", None):
+        own(shift)
+        return True
+    physics = physics_of(env)
+    if physics is None:
+        return False
+    model, data = physics
+    robot = robot_joint(model)
+    if any(each != robot for each in free_joints(model)):
+        return False  # whether the others belong to the robot isn't known
+    if robot is not None:
+        place, speed = int(model.jnt_qposadr[robot]), int(model.jnt_dofadr[robot])
+        quaternion = data.qpos[place + 3 : place + 7]
+        quaternion[:] = turned_quaternion(quaternion)
+        places, speeds = [place, place + 1], [speed, speed + 1]
+    elif root := planar_root(model):
+        places = model.jnt_qposadr[list(root[:2])].tolist()
+        speeds = model.jnt_dofadr[list(root[:2])].tolist()
+        data.qpos[model.jnt_qposadr[root[2]]] += np.pi / 2
+    else:
+        return False
+    data.qpos[places] = turned(data.qpos[places]) + shift
+    data.qvel[speeds] = turned(data.qvel[speeds])
+    data.qacc_warmstart[speeds] = turned(data.qacc_warmstart[speeds])
+    mujoco.mj_forward(model, data)
+    return True
+
+
+def turned(vectors: Array) -> Array:
+    """Vectors (..., 2) of the plane, a quarter turned."""
+    return np.stack((-vectors[..., 1], vectors[..., 0]), -1)
+
+
+def turned_quaternion(quaternions: Array) -> Array:
+    """Quaternions (..., 4), a quarter turned about the vertical axis."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    return np.stack((w - z, x - y, y + x, z + w), -1) * np.sqrt(0.5)
+
+
+def put_factors(
+    model: mujoco.MjModel, usual: mujoco.MjModel, friction: float, mass: float, data: mujoco.MjData
+) -> None:
+    """Give a model the friction and the masses of another one of the same robot, times factors.
+
+    Args:
+        model: to change.
+        usual: where the factors are 1.
+        friction: the factor of all contacts.
+        mass: that of all bodies, with their inertias.
+        data: of a model of the same sizes, whose contents are lost.
+    """
+    for names, factor in ((FRICTIONS, friction), (MASSES, mass)):
+        for name in names:
+            getattr(model, name)[:] = factor * getattr(usual, name)
+    mujoco.mj_setConst(model, data)  # what follows from masses
+
+
+def velocity_after(
+    model: mujoco.MjModel, qpos: Array, push: NDArray[Any], data: mujoco.MjData
+) -> Array:
+    """What a push adds to the velocities of a robot's joints at once, (nv,).
+
+    Args:
+        model: of the robot.
+        qpos: where it is, (nq,).
+        push: on the centre of mass of the body that carries all others that move, (3,): the
+            impulse by the mass of these [m/s].
+        data: as for `put_factors`.
+    """
+    can_move = (model.body_rootid == root_of(model)) & (model.body_weldid > 0)
+    first = int(np.argmax(can_move * model.body_subtreemass))
+    force = np.zeros(model.nv)
+    data.qpos[:] = qpos
+    mujoco.mj_fwdPosition(model, data)
+    impulse = model.body_subtreemass[first] * push
+    mujoco.mj_applyFT(model, data, impulse, np.zeros(3), data.xipos[first], first, force)
+    velocity = np.zeros((1, model.nv))
+    mujoco.mj_solveM(model, data, velocity, force[None])
+    return velocity[0]
+
+
+def can_be_pushed(model: mujoco.MjModel) -> bool:
+    """Whether a push from some side moves a robot, in its first posture or in another one."""
+    data, sides, bent = mujoco.MjData(model), np.eye(3)[:2], model.qpos0.copy()
+    mujoco.mj_integratePos(model, bent, np.ones(model.nv), 1)  # each joint by 1 rad or 1 m
+    moved = [
+        velocity_after(model, qpos, side, data) for qpos in (model.qpos0, bent) for side in sides
+    ]
+    return bool(np.abs(moved).max(initial=0) > 1e-6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +219,7 @@ class MotionReader:
     def __init__(self) -> None:
         self._models: list[mujoco.MjModel] = []
 
-    def __call__(self, lanes: Lanes) -> Mapping[str, Array]:
+    def __call__(self, lanes: "Lanes") -> Mapping[str, Array]:
         """The state of each lane, (n, ...) each; nothing where there is no MuJoCo."""
         if hasattr(lanes.envs, "mujoco_state"):
             self._models = self._models or lanes.envs.models
@@ -69,7 +231,7 @@ class MotionReader:
         self._models = self._models or [physics.model for physics in every]
         return {name: np.stack([getattr(p.data, name) for p in every]) for name in _STATE}
 
-    def motion(self, recording: Recording, lane: int, steps: int) -> Motion | None:
+    def motion(self, recording: "Recording", lane: int, steps: int) -> Motion | None:
         """What the robot of a lane went through in its first steps; None without MuJoCo."""
         if not recording.arrays:
             return None

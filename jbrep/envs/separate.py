@@ -10,45 +10,27 @@ from numpy.typing import NDArray
 
 from jbrep.envs import instances
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
-from jbrep.envs.make import action_in, aside, flattener, number, of_size, reason
+from jbrep.envs.make import action_in, aside, flattener, number, of_size
 from jbrep.envs.task import Array, Task, most_held
-from jbrep.errors import InputError, Notice
+from jbrep.errors import InputError, Notice, kind_and_line
 
 Flags = NDArray[np.bool_]
 State = dict[str, NDArray[Any]]
-_Actions = list[NDArray[np.float32]]
 _LARGEST = float(np.finfo(np.float32).max)  # that data sets and agents can have
-_NOW, _BEFORE = "", "before_"  # begin the names of what a state has of each lane's episodes
 
 
 class EnvironmentFailedError(InputError):
-    """An environment raised an error, or gave something else than its task's description says.
-
-    Attributes:
-        lane: in which it did.
-    """
-
-    def __init__(self, message: str, lane: int):
-        super().__init__(message)
-        self.lane = lane
+    """An environment raised an error, or gave something else than its task's description says."""
 
 
 class Retries:
-    """How often what fails is tried again, in a row.
-
-    Args:
-        most: times.
-    """
+    """How often what fails is tried again, in a row."""
 
     def __init__(self, most: int = 0):
         self._most = self._left = most
 
     def failed(self, error: Exception) -> None:
-        """Tell of a failure.
-
-        Raises:
-            Exception: the error itself, if there were as many before.
-        """
+        """Tell of a failure, or raise it if there were as many before."""
         if not self._left:
             raise error
         self._left -= 1
@@ -61,13 +43,6 @@ class Retries:
 
 class _MissingError(Exception):
     """A reading is missing, before which the episode is to end."""
-
-
-class _Episode:
-    """A lane's episode so far: it follows from the seed and the actions."""
-
-    def __init__(self, seed: int | None = 0):
-        self.seed, self.actions = seed, _Actions()
 
 
 class Separate:
@@ -106,9 +81,8 @@ class Separate:
         self._infos: list[Mapping[str, Any]] = [{} for _ in range(num_lanes)]
         self._succeeded = np.zeros(num_lanes, np.bool_)  # at any step of the episode so far
         self._active = np.zeros(num_lanes, np.bool_)
-        self._episodes = [_Episode() for _ in range(num_lanes)]
-        self._before = [_Episode() for _ in range(num_lanes)]
-        self._last = np.zeros((num_lanes, task.size))  # observations of the episodes before
+        self._seeds: list[int | None] = [0] * num_lanes
+        self._steps = np.zeros(num_lanes, np.int64)  # of each episode, with the one under way
         self._last_reward = np.zeros(num_lanes)  # of the episode under way
         self._held = np.zeros(num_lanes, np.int64)  # steps in a row with missing readings
         self.missing = np.zeros(num_lanes, np.int64)
@@ -122,18 +96,14 @@ class Separate:
     def reset(
         self, seed: Sequence[int | None], options: Mapping[str, Flags]
     ) -> tuple[Array, dict[str, Array]]:
-        """As a vector environment with `reset_mask`."""
         self._make_new_arrays()
         for lane in np.flatnonzero(options["reset_mask"]).tolist():
-            if self._episodes[lane].actions:
-                self._before[lane] = self._episodes[lane]
-                self._last[lane] = self._observation[lane]
             self._begin(lane, seed[lane])
         return self._observation, self._arrays
 
     def _begin(self, lane: int, seed: int | None) -> None:
         """Begin an episode, if need be with another instance."""
-        self._episodes[lane], self._active[lane] = _Episode(seed), True
+        self._seeds[lane], self._steps[lane], self._active[lane] = seed, 0, True
         while True:
             self._held[lane] = self.missing[lane] = self._last_reward[lane] = 0
             self.failed[lane] = False
@@ -141,27 +111,19 @@ class Separate:
                 self.envs[lane] = self.envs[lane] or self._take()
                 with aside():
                     observation, info = self.envs[lane].reset(seed=seed)
-                if not isinstance(info, Mapping):
-                    raise ValueError("too many values to unpack (expected 2")  # old Gym's
                 return self._put(lane, observation, info)
             except Exception as error:
                 self._handle_failure(lane, error)
 
     def step(self, actions: Array) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
-        """As a vector environment."""
-        return self._advance(actions, self._active)
-
-    def _advance(
-        self, actions: Array, chosen: Flags
-    ) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
-        """Step the lanes that are chosen."""
+        chosen = self._active.copy()
         self._make_new_arrays()
         self._reward, self.lost = np.zeros(len(chosen)), np.zeros(len(chosen), np.bool_)
         single = actions.astype(np.float32)
         terminated, truncated = np.zeros((2, len(chosen)), np.bool_)
         with aside():
             for lane in np.flatnonzero(chosen).tolist():
-                self._episodes[lane].actions.append(single[lane])
+                self._steps[lane] += 1
                 try:
                     terminated[lane], truncated[lane] = self._step(lane, single[lane])
                 except _MissingError:
@@ -223,15 +185,12 @@ class Separate:
             return flat, reward  # their sum is larger
         self.missing[lane] += missing.sum() + is_missing
         self._held[lane] += 1
-        if self._task.missing == "skip" and len(self._episodes[lane].actions) > 1:
+        if self._task.missing == "skip" and self._steps[lane] > 1:
             raise _MissingError
         if not after_step or self._held[lane] > most_held(self._task.missing or ""):
             raise EnvironmentFailedError(
                 f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
-                "reward that is not finite in 32 bits, at step "
-                f"{len(self._episodes[lane].actions)} of the episode with seed "
-                f"{self._episodes[lane].seed}; {self._missing_said}",
-                lane,
+                f"reward that is not finite in 32 bits, {self._where(lane)}; {self._missing_said}"
             )
         filled = np.where(missing, self._observation[lane], flat)
         return filled, self._last_reward[lane] if is_missing else reward
@@ -243,30 +202,26 @@ class Separate:
             return "no episode can end before its first step: give --missing hold:1, or more"
         return f"that is beyond --missing {missing}" if missing else "--missing says what to do"
 
+    def _where(self, lane: int) -> str:
+        return f"at step {self._steps[lane]} of the episode with seed {self._seeds[lane]}"
+
     def _lose(self, lane: int) -> None:
         """Let the episode of a lane end before the step that it just took."""
         self.lost[lane], self._reward[lane] = True, 0.0
-        self._episodes[lane].actions.pop()
+        self._steps[lane] -= 1
 
     def _handle_failure(self, lane: int, error: Exception) -> None:
-        """Go on after a failure, with a new instance at the next reset.
-
-        Raises:
-            EnvironmentFailedError: there were too many.
-        """
+        """Go on after a failure, unless there were too many, with a new instance."""
         if self.envs[lane] is not None:
             instances.discard(self.envs[lane])
             self.envs[lane] = None
         if not isinstance(error, EnvironmentFailedError):
             error = EnvironmentFailedError(
-                f"{self._task.name} failed at step {len(self._episodes[lane].actions)} of the "
-                f"episode with seed {self._episodes[lane].seed}: {reason(error)}",
-                lane,
+                f"{self._task.name} failed {self._where(lane)}: {kind_and_line(error)}"
             )
         self._retries[lane].failed(error)
 
     def render(self) -> tuple[Any, ...]:
-        """As a vector environment."""
         with aside():
             return tuple(env.render() for env in self.envs)
 
@@ -279,54 +234,8 @@ class Separate:
         told = zip(self._infos, self._succeeded.tolist(), strict=True)
         return [numbers_in(info) | ({SUCCESS: 1.0} if won else {}) for info, won in told]
 
-    @property
-    def state(self) -> State:
-        """What `restore` takes: the actions of each lane's episode, and of the one before."""
-        now, before = self._played(_NOW, self._episodes), self._played(_BEFORE, self._before)
-        return {**now, **before, f"{_BEFORE}observation": self._last.copy()}
-
-    def _played(self, prefix: str, episodes: Sequence[_Episode]) -> State:
-        lengths = [len(each.actions) for each in episodes]
-        taken = np.zeros((len(episodes), max(lengths), self._task.action_size), np.float32)
-        for lane, each in enumerate(episodes):
-            taken[lane, : len(each.actions)] = each.actions or 0
-        return {
-            f"{prefix}episode_seeds": np.array([each.seed for each in episodes]),
-            f"{prefix}lengths": np.array(lengths),
-            f"{prefix}actions": taken,
-        }
-
-    def restore(self, state: State) -> tuple[Array, dict[str, Array]]:
-        """Play the episodes again; the ones before tell whether these are still the same robots."""
-        played = state[f"{_BEFORE}lengths"] > 0
-        if played.any():
-            self._play(_BEFORE, state)
-            last = state[f"{_BEFORE}observation"]
-            if self._observation[played].tobytes() != last[played].tobytes():
-                raise not_the_same(self._task)
-        self._play(_NOW, state)
-        self._last = state[f"{_BEFORE}observation"].copy()
-        for lane in np.flatnonzero(~played).tolist():
-            self._before[lane] = _Episode()
-        return self._observation, self._arrays
-
-    def _play(self, prefix: str, state: State) -> None:
-        lengths, every_lane = state[f"{prefix}lengths"], np.ones(len(self.envs), np.bool_)
-        seeds = state[f"{prefix}episode_seeds"].tolist()
-        self.reset(seeds, {"reset_mask": every_lane})
-        for step in range(max(lengths.tolist())):
-            self._advance(state[f"{prefix}actions"][:, step], step < lengths)
-
     def close(self) -> None:
         """Give the environments back."""
         for env in self.envs:
             if env is not None:
                 instances.give_back(env)
-
-
-def not_the_same(task: Task) -> InputError:
-    """The error where the same seed and actions lead elsewhere."""
-    return InputError(
-        f"{task.name} is not reproducible here, or another than it was: the same seed and actions "
-        "lead to another state, so this can't continue where it stopped"
-    )

@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import groupby
@@ -27,28 +26,12 @@ NARROW_SEEDS: SeedBits = 31  # and of those of others
 MAX_FEATURES = 4096
 _MAX_ACTIONS = 1024
 EpisodeSteps = Annotated[int, Meta(ge=1, le=MAX_EPISODE_STEPS)]
-Word = Annotated[
-    str,
-    Meta(
-        pattern=r"(?a)\A[A-Za-z][\w.-]{0,99}\Z",
-        title="a letter, then letters, digits, '.', '_', '-'",
-    ),
-]
+Word = Annotated[str, Meta(pattern=r"(?a)\A[A-Za-z][\w.-]{0,99}\Z")]
 Id = Annotated[  # no part of a path leads upwards
-    str,
-    Meta(
-        pattern=r"(?a)\A(\w[\w-]{0,99}/)?\w[\w.-]{0,99}\Z",
-        title="letters, digits, '.', '_', '-' as in Namespace/Name-v0",
-    ),
+    str, Meta(pattern=r"(?a)\A(\w[\w-]{0,99}/)?\w[\w.-]{0,99}\Z")
 ]
-_Group = Annotated[
-    str,
-    Meta(
-        pattern=r"(?a)\A([A-Za-z][\w.-]{0,99})?\Z",
-        title="empty, or a letter, then letters, digits, '.', '_', '-'",
-    ),
-]
-_Unit = Annotated[str, Meta(max_length=40)]
+_Group = Annotated[str, Meta(pattern=r"(?a)\A([A-Za-z][\w.-]{0,99})?\Z")]
+_Unit = Annotated[str, Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]{0,40}\Z")]
 Kind = Literal["scalar", "angle", "quaternion", "vector", "offset", "point"]
 Frame = Literal["", "world", "body", "heading"]
 SPATIAL: Mapping[Kind, range] = {  # kinds of several features, a group of their own; of how many
@@ -58,13 +41,8 @@ SPATIAL: Mapping[Kind, range] = {  # kinds of several features, a group of their
     "point": range(2, 4),
 }
 _Positive = Annotated[float, Meta(gt=0, le=1e12)]
-_Part = Annotated[str, Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]{1,200}\Z", title="a name")]
-Missing = Annotated[
-    str,
-    Meta(
-        pattern=r"\A(skip|hold:[1-9]\d{0,5})\Z", title="skip, or hold and a number of steps: hold:3"
-    ),
-]
+_Part = Annotated[str, Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]{1,200}\Z")]
+Missing = Annotated[str, Meta(pattern=r"\A(skip|hold:[1-9]\d{0,5})\Z")]
 _Arrays = Mapping[Word, Annotated[int, Meta(ge=1, le=MAX_FEATURES)]]
 _Bounds = Annotated[tuple[Finite, ...], Meta(min_length=1, max_length=_MAX_ACTIONS)]
 
@@ -92,27 +70,18 @@ class Feature(Record, frozen=True, array_like=True):
     frame: Frame = ""  # of an angle: world, or relative to something
 
     def check(self) -> None:
-        if not self.unit.isprintable():
-            raise InputError(f"the unit of {self.name} must be a word")
-        if self.kind == "angle":
-            self._check_angle()
-        elif self.kind in ("vector", "offset", "point") and not self.frame:
+        _check_range(self.name, self.low, self.high)
+        if self.kind in ("vector", "offset", "point") and not self.frame:
             raise InputError(
                 f"{self.name} is a {self.kind}: its frame must be world, body or heading"
             )
-        elif self.kind == "point" and self.frame != "world":
-            raise InputError(
-                f"{self.name} is a point in the {self.frame}'s frame: it must be one in the world, "
-                "or an offset"
-            )
-        _check_range(self.name, self.low, self.high)
-
-    def _check_angle(self) -> None:
-        if self.unit not in ("rad", ""):
+        if self.kind == "point" and self.frame != "world":
+            raise InputError(f"{self.name} is a point: its frame must be world; or it is an offset")
+        if self.is_angle and self.unit not in ("rad", ""):
             raise InputError(f"{self.name} is an angle in {self.unit}: it must be in rad")
-        if self.frame not in ("", "world"):
+        if self.is_angle and self.frame not in ("", "world"):
             raise InputError(f"{self.name} is an angle: its frame must be world, or left out")
-        if self.bounded and not self.is_full_turn:
+        if self.is_angle and self.bounded and not self.is_full_turn:
             raise InputError(
                 f"{self.name} is an angle that stays in its range, which must be a full turn: from "
                 "-pi to pi, or from 0 to 2 pi; or say that it isn't bounded"
@@ -170,25 +139,15 @@ class View(Record, frozen=True):
         """Where the features that are seen stand among all."""
         return [i for i, each in enumerate(self.features) if each.name not in self.hidden]
 
-    @property
-    def _broken(self) -> set[str]:
-        """Groups of a vector or quaternion of which neither all is left nor x and y."""
-        found = set()
-        for group, part in groupby(self.features, key=lambda each: each.group):
-            whole = [*part]
-            left = [each for each in whole if each.name not in self.hidden]
-            counts = SPATIAL.get(whole[0].kind)
-            if counts and (len(left) not in counts or left != whole[: len(left)]):
-                found.add(group)
-        return found
-
     def seen(self, low: Sequence[float], high: Sequence[float]) -> tuple[Feature, ...]:
         """Features of the observation, given the bounds of actions, (k,) each."""
-        broken = self._broken
-        now = [
-            each.replace(kind="scalar", frame="") if each.group in broken else each
-            for each in (self.features[i] for i in self.places)
-        ]
+        now = list[Feature]()
+        for _, part in groupby(self.features, key=lambda each: each.group):
+            whole = [*part]
+            left = [each for each in whole if each.name not in self.hidden]
+            counts = SPATIAL.get(whole[0].kind)  # of a vector, all may be left, or x and y
+            is_broken = counts and (len(left) not in counts or left != whole[: len(left)])
+            now += [each.replace(kind="scalar", frame="") if is_broken else each for each in left]
         action = "action" if len(low) == 1 else "action_{}"
         taken = [
             Feature(name=action.format(i), low=a, high=b, bounded=True, group="action")
@@ -219,8 +178,8 @@ class Task(Record, frozen=True):
             generator with the episode's seed; None if unknown.
         state: the arrays that `info` has of each state, by name, with their widths.
         constants: those that stay the same during an episode.
-        made_from: SHA-256 of the files that its arguments name and of the modules that define it,
-            by the names of arguments and modules; packages have versions instead.
+        files: SHA-256 of the robot's own files: those that its arguments name, and the one that
+            defines its class, by the names of arguments and module; packages have versions instead.
         offsets: of features by name, which are subtracted from what the environment gives, so that
             32 bits hold it: everywhere a feature is what is left.
         missing: what becomes of readings that aren't finite: skip ends an episode before one,
@@ -246,24 +205,22 @@ class Task(Record, frozen=True):
     draws: Annotated[int, Meta(ge=0, lt=1 << 32)] | None = None
     state: _Arrays = {}
     constants: _Arrays = {}
-    made_from: Mapping[_Part, Sha256] | UnsetType = UNSET  # left out of files that have none
+    files: Mapping[_Part, Sha256] | UnsetType = UNSET  # left out of JSON where there are none
     offsets: Mapping[Word, Finite] | UnsetType = UNSET
     missing: Missing | UnsetType = UNSET
     view: View | UnsetType = UNSET
     domain: Domain | UnsetType = UNSET
 
     def check(self) -> None:
-        if self.view and self.features != self.view.seen(self.action_low, self.action_high):
-            raise InputError("its features must be those that its view shows")
         try:
             json.dumps(self.arguments, allow_nan=False)
         except (TypeError, ValueError, RecursionError):
             raise InputError("its arguments must be plain JSON, all numbers finite") from None
+        if self.view and self.features != self.view.seen(self.action_low, self.action_high):
+            raise InputError("its features must be those that its view shows")
         if len(set(self.feature_names)) < self.size:
             raise InputError("its features must have different names")
-        _check_side_by_side(self.features)
-        for name, place in self.groups.items():
-            _check_group(name, self.features[place])
+        _check_groups(self.features)
         if self.state.keys() & self.constants.keys():
             raise InputError("the arrays that move and those that don't must have different names")
         _check_range("a reward", self.reward_low, self.reward_high)
@@ -271,7 +228,8 @@ class Task(Record, frozen=True):
             raise InputError("its actions must have as many lower bounds as upper ones")
         if not all(map(float.__le__, self.action_low, self.action_high)):
             raise InputError("each lower bound of its actions must be at most the upper one")
-        _check_spread(self.domain, self.whole.size)
+        if self.domain and len(self.domain.spread) not in (0, self.whole.size):
+            raise InputError("the spread of its domain must be that of all its features")
         if unknown := set(self.offsets or ()) - set(self.whole.feature_names):
             raise InputError(f"offsets has {min(unknown)}, which is none of its features")
 
@@ -389,39 +347,31 @@ class Task(Record, frozen=True):
         return {name: observation[..., place] for name, place in self.groups.items()}
 
 
-def _check_spread(domain: Domain | UnsetType, size: int) -> None:
-    if domain and len(domain.spread) not in (0, size):
-        raise InputError(f"its domain has a spread of {len(domain.spread)} features, not {size}")
-
-
 def _check_range(name: str, low: float | None, high: float | None) -> None:
     if low is not None and high is not None and low > high:
         raise InputError(f"the range of {name} is from {low:g} to {high:g}: swap them")
 
 
-def _check_side_by_side(features: Sequence[Feature]) -> None:
-    """Make sure that no group comes in two parts."""
-    blocks = Counter(
-        name for name, _ in groupby(features, key=lambda each: each.group or each.name)
-    )
-    if several := [name for name, count in blocks.items() if count > 1]:
-        raise InputError(
-            f"features of the group {several[0]!r} must stand side by side: give those that don't "
-            "belong to it a group of their own"
-        )
-
-
-def _check_group(name: str, features: tuple[Feature, ...]) -> None:
-    """Check the number of features of a vector, point or quaternion, which is a group by itself."""
-    kinds = {(each.kind, each.frame) for each in features}
-    kind = next((kind for kind, _ in sorted(kinds) if kind in SPATIAL), None)
-    if kind is None:
-        return
-    if len(kinds) > 1:
-        raise InputError(f"{name} has features beside those of its {kind}: give them another group")
-    if len(features) not in (counts := SPATIAL[kind]):
-        expected = " or ".join(map(str, counts))
-        raise InputError(f"{name} is a {kind} of {len(features)} numbers: it must have {expected}")
+def _check_groups(features: Sequence[Feature]) -> None:
+    """Make sure that groups stand together, and that vectors and the like are groups alone."""
+    seen = set[str]()
+    for name, part in groupby(features, key=lambda each: each.group or each.name):
+        group = [*part]
+        if name in seen:
+            raise InputError(
+                f"features of the group {name!r} must stand side by side: give those that don't "
+                "belong to it a group of their own"
+            )
+        seen.add(name)
+        kinds = {(each.kind, each.frame) for each in group}
+        kind = next((kind for kind, _ in sorted(kinds) if kind in SPATIAL), None)
+        if kind and len(kinds) > 1:
+            raise InputError(
+                f"{name} has features beside those of its {kind}: give them another group"
+            )
+        if kind and len(group) not in SPATIAL[kind]:
+            counts = " or ".join(map(str, SPATIAL[kind]))
+            raise InputError(f"{name} is a {kind} of {len(group)} numbers: it must have {counts}")
 
 
 def _usual_range(feature: Feature) -> tuple[float, float]:
@@ -460,30 +410,14 @@ def check_same(expected: Task, actual: Task, what: str) -> None:
             f"{expected.name}"
         )
     if actual.feature_names != expected.feature_names:
+        others = set(actual.feature_names) ^ set(expected.feature_names)
+        such = f", such as {min(others)}" if others else ""
         raise InputError(
-            f"{what} was made for other features of {actual.name}, "
-            f"{_other_features(expected.feature_names, actual.feature_names)}: give the same "
-            "--hide, --history and --features"
+            f"{what} was made for other features of {actual.name}{such}: give the same --hide, "
+            "--history and --features"
         )
     if (actual.offsets or {}) != (expected.offsets or {}):
         raise InputError(
             f"{what} was made for features of {actual.name} with other offsets: give those in "
             "--features"
         )
-
-
-def _other_features(expected: Sequence[str], actual: Sequence[str]) -> str:
-    if unknown := [name for name in actual if name not in expected]:
-        return f"such as {unknown[0]}, which isn't here"
-    if missing := [name for name in expected if name not in actual]:
-        return f"without {missing[0]}"
-    return "in another order"
-
-
-def changed_parts(there: Task, now: Task) -> str:
-    """Of what is not what it was when an environment was described, for a message; or nothing."""
-    before, after = there.made_from or {}, now.made_from or {}
-    names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
-    return ", ".join(
-        f"{name} ({file})" if (file := now.arguments.get(name)) else name for name in names
-    )

@@ -13,7 +13,6 @@ from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.settings import IMPORTED
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import as_file
 from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
 from jbrep.evaluate import control, readout
@@ -51,8 +50,8 @@ def write(
         if exists(path):
             there = read_document(path, Evaluation)
             known = there.data.fingerprint, there.data.truth, there.hashes, there.policy
-            on = data.dataset.manifest.fingerprint, truth.manifest.fingerprint if truth else UNSET
-            if known != (*on, hashes(judged), policy.name if policy else None):
+            on = data.dataset.fingerprint, truth.fingerprint if truth else UNSET
+            if known != (*on, _hashes(judged), policy.name if policy else None):
                 other = f"{path} is not an evaluation of these encoders on this data"
                 raise InputError(f"{other}: choose another --out")
         evaluation = diagnose(judged, data, policy, truth)
@@ -78,7 +77,7 @@ def diagnose(
     header = EncoderHeader(kind=FULL, name=FULL, environment=data.task)
     full = Encoder(header, data.scaler, (), ())
     results, needed = _side_by_side({FULL: full, **judged}, held_out, policy)
-    sha256 = hashes(judged)
+    sha256 = _hashes(judged)
     return Evaluation(
         data=_judged_on(held_out),
         resamples=RESAMPLES,
@@ -89,10 +88,8 @@ def diagnose(
     )
 
 
-def hashes(encoders: Mapping[str, BaseEncoder]) -> dict[str, str]:
-    """SHA-256 of encoders by label; of a module, that of the file that a run keeps of it."""
-    with single_thread():
-        return {label: as_file(encoder).fingerprint for label, encoder in encoders.items()}
+def _hashes(encoders: Mapping[str, BaseEncoder]) -> dict[str, str]:
+    return {label: encoder.fingerprint for label, encoder in encoders.items()}
 
 
 def _side_by_side(
@@ -176,7 +173,7 @@ def seen(encoder: BaseEncoder, data: ScaledDataset) -> Literal["no test row", "n
     """Which of these rows an encoder saw in training."""
     source = encoder.header.data if isinstance(encoder, Encoder) else {}
     manifest = data.dataset.manifest
-    if source.get("fingerprint") == manifest.fingerprint:
+    if source.get("fingerprint") == data.dataset.fingerprint:
         return "no test row"
     policy = source.get("policy")
     kinds = [manifest.settings.policy["kind"]]
@@ -190,13 +187,13 @@ def _judged_on(held_out: HeldOut) -> JudgedOn:
     data, manifest = held_out.data, held_out.data.dataset.manifest
     return JudgedOn(
         task=data.task.name,
-        fingerprint=manifest.fingerprint,
+        fingerprint=data.dataset.fingerprint,
         policy=dict(manifest.settings.policy),
         seed=manifest.settings.seed,
         train_rows=len(data.train),
         test_rows=len(data.test),
         test_episodes=len(held_out.numbers),
         constant_features=data.constant_features,
-        truth=held_out.shown.manifest.fingerprint if held_out.shown else UNSET,
+        truth=held_out.shown.fingerprint if held_out.shown else UNSET,
         hidden=held_out.hidden or UNSET,
     )

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from msgspec import UNSET, UnsetType
 
-from jbrep.records.document import Document, sealed
+from jbrep.records.document import Document
 from jbrep.records.record import Record
 from jbrep.stats.bootstrap import Interval
 
@@ -133,7 +133,6 @@ class Evaluation(Document, frozen=True, kw_only=True):
 
     format: ClassVar[str] = "jbrep evaluation"
     format_version: ClassVar[int] = 4
-    max_bytes: ClassVar[int] = 1 << 28
     indent: ClassVar[int] = 1
 
     data: JudgedOn
@@ -150,7 +149,7 @@ class Evaluation(Document, frozen=True, kw_only=True):
 
     def text(self) -> str:
         """As JSON, with numbers of six digits and each list of numbers on one line."""
-        text = json.dumps(sealed(_rounded(self.as_json())), indent=self.indent)
+        text = json.dumps(_rounded(self.as_json()), indent=self.indent)
         parts = re.compile(r'"(?:[^"\\]|\\.)*"|\[[-+.,\deEnul\s]*\]')  # text stays as it is
 
         def on_one_line(part: re.Match[str]) -> str:

@@ -84,10 +84,7 @@ class HeldOut:
 
 def hidden_of(dataset: Dataset, truth: Dataset) -> tuple[str, ...]:
     """The features that a data set of the same motion has beside those of another."""
-    moved, seen = (
-        [shard.sha256["action"] for shard in each.manifest.shards] for each in (truth, dataset)
-    )
-    if moved != seen:
+    if not np.array_equal(truth["action"], dataset["action"]):
         raise InputError(
             f"{truth.folder} has other actions than {dataset.folder}: the truth must be the data "
             "set that it was derived from"

@@ -10,8 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.envs.mujoco import root_of
-from jbrep.envs.physics import Motion
+from jbrep.envs.physics import Motion, root_of
 from jbrep.envs.task import Array
 from jbrep.inspection.recording import Recording
 

@@ -213,6 +213,8 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
 
     changeable = ("friction", "mass", "push", "body")  # by a domain, see `jbrep.envs.domain`
 
+    resets_lanes = True  # as `jbrep.envs.make.is_batched` asks
+
     def __init__(
         self,
         task: str,
@@ -308,25 +310,12 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         """What pictures of the lanes follow from: arrays of `mujoco.MjData`, (n, ...) each."""
         return self.simulation.mujoco_state
 
-    @property
-    def state(self) -> dict[str, NDArray[Any]]:
-        """A copy of what `restore` takes; generators are left out, as `reset` can take seeds."""
-        return {
-            **self.simulation.state,
-            "last_observation": self._observation.copy(),
-            "episode_steps": self._steps.copy(),
-        }
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> tuple[Observation, dict[str, Any]]:
-        """Continue from where the state was taken, to the same bits; as `reset` else."""
-        physics = dict(state)
-        self._steps[:] = physics.pop("episode_steps")
-        self._observation = physics.pop("last_observation").copy()
-        self.simulation.restore(**physics)
-        return self._view(self._observation), self._info()
+    def look(self) -> Array:
+        """The observations, (n, d), once the simulation was brought to other states."""
+        self._observation = self.simulation.observe()
+        return self._observation
 
     def push(self, velocity: Array) -> None:
-        """As `jbrep.jitterbug.simulation.Simulation.push`."""
         self.simulation.push(velocity)
 
     def _restart(self, lanes: Sequence[int], options: Mapping[str, Any] = {}) -> None:

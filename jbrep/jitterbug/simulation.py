@@ -10,9 +10,8 @@ from mujoco.batch import Batch
 from numpy.typing import ArrayLike, NDArray
 
 from jbrep.envs.lanes import check_counts
-from jbrep.envs.mujoco import turned, turned_quaternion
+from jbrep.envs.physics import put_factors, turned, turned_quaternion, velocity_after
 from jbrep.envs.task import Array
-from jbrep.envs.varied import put_factors, velocity_after
 from jbrep.jitterbug import bodies, model
 from jbrep.jitterbug.tasks import QUATERNION, JitterbugTask, Readings, yaw_direction
 
@@ -118,7 +117,6 @@ class Simulation:
 
     @property
     def state(self) -> dict[str, Array]:
-        """A copy of what `restore` takes, (n, ...) each; with `body` if there are other bodies."""
         now = self.readings
         state = {
             "qpos": now.qpos.copy(),

@@ -1,4 +1,4 @@
-"""Controls, which learn nothing: the whole observation, some of it, noise, random networks."""
+"""What learns nothing: the whole observation, some of it, noise, random directions and networks."""
 
 from typing import Annotated, ClassVar, Self
 
@@ -7,8 +7,9 @@ from msgspec import Meta
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import FULL
+from jbrep.encoders.layers import dense
 from jbrep.errors import InputError
-from jbrep.methods.linear import dense, linear_code
+from jbrep.methods.linear import linear_code
 from jbrep.training.method import ClosedForm, Coded, Made, Network
 from jbrep.training.network import get_architecture, layers, stacks
 from jbrep.training.settings import Architecture, Names, On, Scaling, Seed
@@ -129,3 +130,28 @@ class Untrained(Network, ClosedForm, frozen=True, kw_only=True):
         architecture = get_architecture(self.architecture)
         encoder, decoder = stacks(architecture, data.size, self.latent, self.seed)
         return Made(layers(encoder), layers(decoder))
+
+
+class Fourier(Coded, ClosedForm, frozen=True, kw_only=True):
+    """Sines of random directions, in which functions of the observation are nearly linear."""
+
+    name: ClassVar[str] = "fourier"
+    min_reduction: ClassVar[int | None] = None
+
+    frequency: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=1000,
+            description="Standard deviation of what a phase turns while a scaled feature goes from "
+            "0 to 1 [rad].",
+        ),
+    ] = 0.5
+    seed: Seed = 0
+
+    def make(self, data: ScaledDataset) -> Made:
+        """sin(W x + b), with W of N(0, frequency^2) and b uniform (Rahimi and Recht 2007)."""
+        generator = np.random.default_rng(self.seed)
+        weight = self.frequency * generator.normal(size=(self.latent, data.size))
+        phase = generator.uniform(-np.pi, np.pi, self.latent)
+        return Made((dense(weight, phase, "sin"),))

@@ -7,7 +7,7 @@ episode; here targets lie in [0, 1] and in the same episode. Theirs saw 128,000 
 from typing import Annotated, ClassVar
 
 import torch
-from msgspec import Meta, field
+from msgspec import Meta
 from torch import Tensor, nn
 
 from jbrep.dataset import ScaledDataset
@@ -15,15 +15,7 @@ from jbrep.methods.vae import cross_entropy, sigmoid_layers
 from jbrep.training.method import Reconstructing
 from jbrep.training.network import layers, seeded, stack
 from jbrep.training.objective import Layers, Objective, feature_weights
-from jbrep.training.settings import (
-    MAX_HORIZON,
-    BatchSize,
-    Epochs,
-    FeatureWeights,
-    LearningRate,
-    Seed,
-    Weight,
-)
+from jbrep.training.settings import MAX_HORIZON, BatchSize, Epochs, LearningRate, Weight
 from jbrep.training.windows import Windows
 
 _DECAY, _DECAY_STEPS = 0.96, 1000  # of the learning rate, and how often
@@ -42,8 +34,6 @@ class Ddae(Reconstructing, frozen=True, kw_only=True):
     batch_size: BatchSize = 256
     learning_rate: LearningRate = 1e-3
     weight_decay: Annotated[Weight, Meta(description="Weight of half the squared weights.")] = 1e-5
-    seed: Seed = 0
-    weights: FeatureWeights = field(default_factory=dict)
 
     def objective(self, data: ScaledDataset) -> Objective:
         return DdaeObjective(self, data)
@@ -86,10 +76,9 @@ class DdaeObjective(Objective):
         return error + self._decay * squares.sum() / 2
 
     def rate(self, progress: float, step: int) -> float:
-        """As for `Objective`: the authors' steps."""
         return _DECAY ** (step // _DECAY_STEPS)
 
     def layers(self) -> tuple[Layers, Layers | None]:
-        """As for `Objective`; what gives a later row is no decoder of this one."""
+        # what gives a later row is no decoder of this one
         decoder = None if self.horizon else sigmoid_layers(layers(self.decoder))
         return layers(self.encoder), decoder

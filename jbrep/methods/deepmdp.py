@@ -12,15 +12,7 @@ from jbrep.errors import InputError
 from jbrep.training.method import Learned, Network
 from jbrep.training.network import HIDDEN, get_architecture, seeded, stack
 from jbrep.training.objective import Objective
-from jbrep.training.settings import (
-    BatchSize,
-    Epochs,
-    LearningRate,
-    RewardWeight,
-    Seed,
-    TransitionWeight,
-    Weight,
-)
+from jbrep.training.settings import Architecture, RewardWeight, TransitionWeight, Weight
 from jbrep.training.windows import Windows
 
 _SMALL = 1e-6  # standard deviation of a reward that says nothing
@@ -31,13 +23,10 @@ class DeepMDP(Network, Learned, frozen=True, kw_only=True):
 
     name: ClassVar[str] = "deepmdp"
 
+    architecture: Architecture = "deep"
     reward: RewardWeight = 1.0
     transition: TransitionWeight = 1.0
     lipschitz: Annotated[Weight, Meta(description="Weight of the Lipschitz penalty.")] = 0.1
-    epochs: Epochs = 12
-    batch_size: BatchSize = None
-    learning_rate: LearningRate = 2e-3
-    seed: Seed = 0
 
     def check_data(self, data: ScaledDataset) -> None:
         super().check_data(data)
@@ -87,11 +76,8 @@ class DeepMDPObjective(Objective):
         architecture = get_architecture(method.architecture)
         size, self._latent = data.size, method.latent
         inputs = self._latent + data.task.action_size
-        self._weights = {
-            "reward": method.reward,
-            "transition": method.transition,
-            "lipschitz": method.lipschitz,
-        }
+        terms = "reward", "transition", "lipschitz"
+        self._weights = {term: getattr(method, term) for term in terms}
         with seeded(method.seed):
             self.encoder = stack((size, *architecture.hidden, self._latent), architecture.code)
             self.reward = stack((inputs, HIDDEN, HIDDEN, 1), "linear")
@@ -105,7 +91,6 @@ class DeepMDPObjective(Objective):
         self._deviation = deviation.clamp(min=_SMALL)
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """As `Windows.steps`, and the standardised rewards (n, 1)."""
         rewards = (windows.rewards(numbers) - self._mean) / self._deviation
         return *windows.steps(numbers), rewards[:, None]
 

@@ -17,26 +17,21 @@ from jbrep.encoders.file import SUFFIX
 from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader
 from jbrep.encoders.names import check_name
 from jbrep.errors import InputError, differences
-from jbrep.methods.held_out import held_out_error
-from jbrep.methods.purpose import purpose
-from jbrep.methods.registry import get_method, name_of
+from jbrep.methods.held_out import held_out_error, ratio_to_pca
+from jbrep.methods.linear import PCA
+from jbrep.methods.registry import METHODS, get_method, name_of
 from jbrep.methods.shape import complete
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, inside, make_folder
+from jbrep.records.storage import exists, make_folder
 from jbrep.training import checkpoint
-from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method
-from jbrep.training.network import check_layers
-from jbrep.training.trainer import (
-    Epoch,
-    Schedule,
-    Trainer,
-    default_batch_size,
-    get_device,
-    single_thread,
-)
+from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method, Reconstructing
+from jbrep.training.trainer import Epoch, Trainer, default_batch_size, get_device, single_thread
 from jbrep.training.windows import Windows, count_windows, watched_windows
+
+_ALIKE = 0.05  # of PCA's error, within which another is as good
+_POOR = 1.5  # times PCA's error, from which a trained autoencoder deserves a warning
 
 
 class Fitted(NamedTuple):
@@ -87,13 +82,8 @@ class Fitter:
 
     The encoder `dae-8` is the file `dae-8.safetensors` there; the folder `dae-8.training` beside it
     has TensorBoard's scalars and, until training is finished, the checkpoint to resume from.
-
-    Args:
-        data: to learn from.
-        folder: created if it doesn't exist.
-        device: to train on: cpu, cuda, or auto.
-        memory: bytes that training rows may take: more are read from disk in each epoch, to the
-            same file; None for half of what is free.
+    `memory` is bytes that training rows may take, by default half of what is free: more are read
+    from disk in each epoch, to the same file.
     """
 
     def __init__(
@@ -111,15 +101,10 @@ class Fitter:
         self._windows: dict[tuple[ScaledDataset, int], tuple[Windows, Windows]] = {}
 
     def fit(self, kind: str, *, name: str | None = None, **settings: Any) -> Fitted:
-        """Make an encoder, unless its file is complete already.
+        """Make an encoder by the method `kind`, unless its file is complete already.
 
         An interrupted training leaves its best parameters so far in the file, and its checkpoint,
-        from which the same call resumes.
-
-        Args:
-            kind: a key of METHODS.
-            name: of the encoder; made from the method and its settings if not given.
-            settings: of the method, as text or values.
+        from which the same call resumes. Settings are text or values.
         """
         with single_thread():
             plan = self.plan(kind, name=name, **settings)
@@ -135,9 +120,7 @@ class Fitter:
         check_name(name)
         method.check_data(data)
         if isinstance(method, Learned):
-            objective = method.objective(data)
-            check_layers(*objective.layers())
-            windows = count_windows(data, objective.horizon)
+            windows = count_windows(data, method.objective(data).horizon)
             if not method.batch_size:
                 method = method.replace(batch_size=default_batch_size(windows))
         plan = Plan(method, data, _header(method, name, data), self._folder / f"{name}{SUFFIX}")
@@ -165,7 +148,7 @@ class Fitter:
         return self._data.rescaled(method.scaling, coordinates, method.clip, method.keep)
 
     def _make_once(self, plan: Plan) -> bool:
-        """Make an encoder, unless another process has made it meanwhile; whether it did."""
+        """Make it unless another process has made it meanwhile; whether it did."""
         make_folder(self._folder)
         with exclusive(plan.path, beside=True):
             if plan.is_complete():
@@ -178,21 +161,14 @@ class Fitter:
             case ClosedForm() as method:
                 self._save(plan, method.make(plan.data))
             case Learned() as method:
-                work = inside(self._folder, plan.path.with_suffix(".training").name)
-                make_folder(work)
-                self._train(plan, method, work)
+                self._train(plan, method)
 
-    def _train(self, plan: Plan, method: Learned, work: Path) -> None:
-        """Train from the checkpoint, if there is one, or from the start."""
+    def _train(self, plan: Plan, method: Learned) -> None:
+        work = plan.path.with_suffix(".training")
+        make_folder(work)
         header, objective = plan.header, method.objective(plan.data).to(self._device)
         windows, watched = self._windows_of(plan.data, objective.horizon)
-        schedule = Schedule(
-            epochs=method.epochs,
-            batch_size=method.batch_size,
-            learning_rate=method.learning_rate,
-            seed=method.seed,
-        )
-        trainer = Trainer(objective, schedule, windows, watched)
+        trainer = Trainer(objective, method, windows, watched)
         versions = {"device": self._device.type, "torch": header.versions["torch"]}
         identity = {**_origin(header), **versions}
         saved = work / "checkpoint.safetensors"
@@ -210,7 +186,6 @@ class Fitter:
         saved.unlink()
 
     def _windows_of(self, data: ScaledDataset, horizon: int) -> tuple[Windows, Windows]:
-        """Windows to train on, and to watch the loss on; those of the last encoder, if they fit."""
         key = data, horizon
         if key not in self._windows:
             train = Windows(data, data.train, horizon, self._device, self._memory)
@@ -250,7 +225,7 @@ def _header(method: Method, name: str, data: ScaledDataset) -> EncoderHeader:
         environment=data.task,
         training=method.training,
         data={
-            "fingerprint": manifest.fingerprint,
+            "fingerprint": data.dataset.fingerprint,
             "policy": dict(manifest.settings.policy),
             "seed": manifest.settings.seed,
             "train_rows": len(data.train),
@@ -275,3 +250,26 @@ def _with_progress(trainer: Trainer, name: str) -> Iterator[Epoch]:
             progress.set_postfix(train=f"{epoch.train_loss:.5f}", test=f"{epoch.test_loss:.5f}")
             progress.update()
             yield epoch
+
+
+def purpose(encoder: Encoder, data: ScaledDataset) -> str:
+    """How good an encoder that was made of these data is at what its kind is for, in words.
+
+    Empty of one that is for nothing of its own.
+    """
+    method = METHODS[encoder.kind]
+    if not issubclass(method, Reconstructing | PCA):
+        return method.achieved(encoder.header.metrics, encoder.latent_size - len(encoder.kept))
+    error = f"{encoder.header.metrics[HELD_OUT_MSE]:.5f}, of features scaled to [-1, 1]"
+    ratio = ratio_to_pca(encoder, data)
+    if method is PCA or ratio is None:
+        return f"reconstructs held-out states with a mean squared error of {error}"
+    beside = "better than" if ratio < 1 else "worse than"
+    beside = "as well as" if abs(ratio - 1) < _ALIKE else beside
+    told = f"reconstructs held-out states {beside} PCA: {ratio:.2f} times its error ({error})"
+    if ratio <= _POOR:
+        return told
+    return (
+        f"{told}; train for more --epochs, on more data, or with another --learning-rate or "
+        "--batch-size"
+    )

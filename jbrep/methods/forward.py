@@ -21,15 +21,7 @@ from jbrep.methods.linear_forward import (
 from jbrep.training.method import Learned, Network
 from jbrep.training.network import HIDDEN, get_architecture, seeded, stack
 from jbrep.training.objective import Objective
-from jbrep.training.settings import (
-    BatchSize,
-    Codes,
-    Epochs,
-    LearningRate,
-    RewardWeight,
-    Seed,
-    Weight,
-)
+from jbrep.training.settings import Architecture, Codes, RewardWeight, Weight
 from jbrep.training.windows import Windows
 
 _FITTED = 200_000  # windows to which targets are standardised
@@ -46,16 +38,13 @@ class Forward(Network, Learned, frozen=True, kw_only=True):
 
     name: ClassVar[str] = "forward"
 
+    architecture: Architecture = "deep"
     codes: Codes = "standard"
     horizons: Horizons = (1, 5, 10, 20)
     changes: ChangesWeight = 1.0
     values: ValuesWeight = 1.0
     reward: RewardWeight = 1.0
     inverse: Annotated[Weight, Meta(description="Weight of the action, from now and later.")] = 0.0
-    epochs: Epochs = 12
-    batch_size: BatchSize = None
-    learning_rate: LearningRate = 2e-3
-    seed: Seed = 0
 
     def check_data(self, data: ScaledDataset) -> None:
         super().check_data(data)
@@ -85,14 +74,10 @@ class _Batch(NamedTuple):
 
 
 class Predictors(nn.Module):
-    """Networks of one shape, of which each reads the first of some shared inputs.
+    """Networks of one shape, of which each reads the first so many of some shared inputs.
 
     Each has two hidden layers of ReLU. Features come first and rows last, and all networks are
     multiplied at once: with so few units, a step of separate ones is bound by calls and by memory.
-
-    Args:
-        reads: for each network, how many of the inputs it reads.
-        outputs: numbers that each gives.
     """
 
     _read: Tensor
@@ -179,7 +164,6 @@ class ForwardObjective(Objective):
         return torch.cat((change, then, windows.rewards(numbers, ahead)[None]))
 
     def batch(self, windows: Windows, numbers: Tensor) -> _Batch:
-        """As for `Objective`, but with the windows last."""
         now = windows.rows(numbers).T.contiguous()
         targets = torch.stack([self._targets(windows, numbers, now, k) for k in self._horizons])
         return _Batch(

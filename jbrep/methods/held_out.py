@@ -19,12 +19,8 @@ def held_out_error(
 ) -> float:
     """Mean squared error of the reconstruction over all held-out rows, scaled to [-1, 1].
 
-    Rounded to six digits: the others depend on the number of threads.
-
-    Args:
-        encoder: that can decode.
-        data: whose held-out part is reconstructed.
-        not_decoded: names of features whose errors count as 0.
+    Features that are `not_decoded` count as 0. Rounded to six digits: the others depend on the
+    number of threads.
     """
     decoded = [name not in not_decoded for name in data.task.feature_names]
     total = 0.0
@@ -56,14 +52,8 @@ def lost(
 def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
     """An encoder's held-out error as a multiple of PCA's, with as many components.
 
-    Both are of what the encoder tells at all: symmetry leaves out where the robot is.
-
-    Args:
-        encoder: made from this data.
-        data: what PCA is fitted on.
-
-    Returns:
-        The ratio; None where PCA loses nothing.
+    Both are of what the encoder tells at all: symmetry leaves out where the robot is. None where
+    PCA loses nothing.
     """
     if encoder.latent_size >= data.task.size:
         return None

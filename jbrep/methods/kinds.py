@@ -21,5 +21,5 @@ KINDS = {
     "self-prediction": "jbrep.methods.self_prediction:SelfPrediction",
     "deepmdp": "jbrep.methods.deepmdp:DeepMDP",
     "ofe": "jbrep.methods.ofe:OFE",
-    "fourier": "jbrep.methods.fourier:Fourier",
+    "fourier": "jbrep.methods.controls:Fourier",
 }

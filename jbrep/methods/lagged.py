@@ -14,8 +14,6 @@ from jbrep.methods.passes import Block, blocks, check_enough
 from jbrep.training.method import Made
 from jbrep.training.settings import Steps
 
-LAGS = (1, 2, 5, 10, 20, 50, 100)  # of the spectra that files keep, beside those asked for
-
 Lags = Annotated[Steps, Meta(description="Steps from now to later, one or several.")]
 
 
@@ -31,7 +29,6 @@ class Lagged:
         now: what is now, of a block of windows, (m, n).
 
     Attributes:
-        lags: those, and the smaller ones of LAGS, in order.
         now_mean: (n,).
         now: E[x x'] of what is now, (n, n).
         later_mean: of the rows at each lag, (lags, size).
@@ -46,10 +43,7 @@ class Lagged:
         width: int,
         now: Callable[[Block], Array],
     ):
-        longest = max(lags)
-        self.lags = tuple(sorted({*lags, *(lag for lag in LAGS if lag < longest)}))
-        count, size = len(self.lags), data.size
-        windows = 0
+        longest, count, size, windows = max(lags), len(lags), data.size, 0
         self.now_mean, self.later_mean = np.zeros(width), np.zeros((count, size))
         self.now, self.later = np.zeros((width, width)), np.zeros((count, size, size))
         self.across = np.zeros((count, width, size))
@@ -59,7 +53,7 @@ class Lagged:
             windows += len(block)
             self.now_mean += first.sum(axis=0)
             self.now += first.T @ first
-            for i, lag in enumerate(self.lags):
+            for i, lag in enumerate(lags):
                 after = block.later(lag)
                 self.later_mean[i] += after.sum(axis=0)
                 self.across[i] += first.T @ after
@@ -67,10 +61,6 @@ class Lagged:
         check_enough(windows, width, data, longest, "a smaller lag")
         for total in (self.now_mean, self.now, self.later_mean, self.later, self.across):
             total /= windows
-
-    def places(self, lags: tuple[int, ...]) -> list[int]:
-        """Where these lags are among all."""
-        return [self.lags.index(lag) for lag in lags]
 
 
 def _correlations(metrics: Mapping[str, Any], latent: int) -> str:
@@ -102,23 +92,15 @@ class Slow(Directions, frozen=True, kw_only=True):
 
     def make(self, data: ScaledDataset) -> Made:
         lagged = Lagged(data, self.lags, data.size, lambda block: block.later(0))
-        eigenvalues, directions, moments = _slowest(lagged, self.lags, data)
-        spectra = {str(lag): _slowest(lagged, (lag,), data)[0].tolist() for lag in lagged.lags}
-        return direction_code(directions[: self.latent], moments, eigenvalues, spectra=spectra)
-
-
-def _slowest(
-    lagged: Lagged, lags: tuple[int, ...], data: ScaledDataset
-) -> tuple[Array, Array, Moments]:
-    """Eigenvalues, the largest first, and directions (size, size), with the moments of the rows."""
-    places = lagged.places(lags)
-    mean = (lagged.now_mean + lagged.later_mean[places].mean(axis=0)) / 2
-    outer = np.outer(mean, mean)
-    covariance = (lagged.now + lagged.later[places].mean(axis=0)) / 2 - outer
-    across = lagged.across[places].mean(axis=0)
-    whiten = whitening(covariance, data)
-    eigenvalues, vectors = np.linalg.eigh(whiten @ ((across + across.T) / 2 - outer) @ whiten.T)
-    return eigenvalues[::-1], vectors[:, ::-1].T @ whiten, Moments(mean, covariance)
+        mean = (lagged.now_mean + lagged.later_mean.mean(axis=0)) / 2
+        outer = np.outer(mean, mean)
+        covariance = (lagged.now + lagged.later.mean(axis=0)) / 2 - outer
+        across = lagged.across.mean(axis=0)
+        whiten = whitening(covariance, data)
+        lagging = whiten @ ((across + across.T) / 2 - outer) @ whiten.T
+        eigenvalues, vectors = np.linalg.eigh(lagging)
+        directions = vectors[:, ::-1][:, : self.latent].T @ whiten
+        return direction_code(directions, Moments(mean, covariance), eigenvalues[::-1])
 
 
 class Vamp(Directions, frozen=True, kw_only=True):
@@ -149,29 +131,23 @@ class Vamp(Directions, frozen=True, kw_only=True):
         return f"tells the state a lag later: units correlate {found} with it"
 
     def make(self, data: ScaledDataset) -> Made:
-        lags, size = self.lags, data.size
-        longest = max(lags)
+        size, longest = data.size, max(self.lags)
 
         def now(block: Block) -> Array:
             return np.hstack((block.later(0), block.next_actions(longest)))
 
-        lagged = Lagged(data, lags, size + longest * data.task.action_size, now)
+        lagged = Lagged(data, self.lags, size + longest * data.task.action_size, now)
         whiten, correlations = _partial(lagged, data)
-        chosen = np.concatenate(correlations[lagged.places(lags)], axis=1) / np.sqrt(len(lags))
-        left, singular, _ = np.linalg.svd(chosen, full_matrices=False)
+        side_by_side = np.concatenate(correlations, axis=1) / np.sqrt(len(self.lags))
+        left, singular, _ = np.linalg.svd(side_by_side, full_matrices=False)
         mean = lagged.now_mean[:size]
         covariance = lagged.now[:size, :size] - np.outer(mean, mean)
-        spectra = np.linalg.svd(correlations, compute_uv=False).tolist()
-        return direction_code(
-            left[:, : self.latent].T @ whiten,
-            Moments(mean, covariance),
-            singular,
-            spectra=dict(zip(map(str, lagged.lags), spectra, strict=True)),
-        )
+        directions = left[:, : self.latent].T @ whiten
+        return direction_code(directions, Moments(mean, covariance), singular)
 
 
-def _partial(lagged: Lagged, data: ScaledDataset) -> tuple[Array, Array]:
-    """C_xx.a^(-1/2), (size, size), and K at each lag, (lags, size, size)."""
+def _partial(lagged: Lagged, data: ScaledDataset) -> tuple[Array, list[Array]]:
+    """C_xx.a^(-1/2), (size, size), and K at each lag."""
     size = data.size
     now = lagged.now - np.outer(lagged.now_mean, lagged.now_mean)
     shared = now[:size, size:]
@@ -187,4 +163,4 @@ def _partial(lagged: Lagged, data: ScaledDataset) -> tuple[Array, Array]:
         joint = both[:size] - effect @ both[size:]
         after = whitening(rest, data, np.diag(whole), others)
         correlations.append(whiten @ joint @ after.T)
-    return whiten, np.array(correlations)
+    return whiten, correlations

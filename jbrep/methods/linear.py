@@ -1,12 +1,12 @@
 """Linear codes: principal components, and what every method that finds directions needs."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.encoders.layers import Layer
+from jbrep.encoders.layers import dense
 from jbrep.envs.task import Array
 from jbrep.errors import InputError
 from jbrep.training.method import ClosedForm, Coded, Made
@@ -37,12 +37,6 @@ def linear_code(weight: Array, moments: Moments) -> tuple[Layers, Layers]:
     return (dense(weight, -weight @ mean),), (dense(back, mean),)
 
 
-def dense(weight: Array, bias: Array, activation: str = "linear") -> Layer:
-    """A layer from float64."""
-    single = np.ascontiguousarray(weight, dtype=np.float32)
-    return Layer(single, bias.astype(np.float32), activation)
-
-
 def signed(weight: Array) -> Array:
     """Rows (l, d) with signs that make the largest weight of each positive."""
     largest = np.abs(weight).argmax(axis=1, keepdims=True)
@@ -59,19 +53,15 @@ def inverse_root(covariance: Array, what: str) -> Array:
     return (vectors / np.sqrt(variances)) @ vectors.T
 
 
-def direction_code(directions: Array, moments: Moments, spectrum: Array, **metrics: Any) -> Made:
-    """The linear code of some directions (l, d), each unit with standard deviation 1/3.
+def direction_code(directions: Array, moments: Moments, spectrum: Array) -> Made:
+    """The linear code of directions (l, d) of any length, each unit with standard deviation 1/3.
 
-    Args:
-        directions: of the code, of any length.
-        moments: of the rows.
-        spectrum: what the method says of all directions, the largest first.
-        metrics: more of what it says.
+    `spectrum` is what the method says of all directions, the largest first.
     """
     mean, covariance = moments
     variances = np.einsum("li,ij,lj->l", directions, covariance, directions)
     weight = DEVIATION * signed(directions / np.sqrt(variances)[:, None])
-    return Made((dense(weight, -weight @ mean),), None, {"spectrum": spectrum.tolist(), **metrics})
+    return Made((dense(weight, -weight @ mean),), None, {"spectrum": spectrum.tolist()})
 
 
 def whitening(
@@ -79,11 +69,8 @@ def whitening(
 ) -> Array:
     """W with W C W' = I, for a covariance C of the features (size, size).
 
-    Args:
-        covariance: C.
-        data: that it is of.
-        total: variances that show what is negligible, where C is what a regression left of them.
-        others: what features would be linear functions of, if C were singular.
+    `total` are the variances that show what is negligible, where C is what a regression on `others`
+    left of them.
     """
     deviation = np.sqrt(np.maximum(np.diag(covariance) if total is None else total, _TINY))
     variances, vectors = np.linalg.eigh(covariance / np.outer(deviation, deviation))

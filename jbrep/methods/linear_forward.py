@@ -128,9 +128,7 @@ def weights_of(method: Any) -> dict[str, float]:
 def check_targets(data: ScaledDataset, kind: str, weights: Mapping[str, float]) -> None:
     """Make sure that a kind of method has something to predict, with these weights of targets."""
     weighted = [name for name, weight in weights.items() if weight]
-    if not weighted:
-        raise InputError(f"{kind} has nothing to predict: all its weights are 0")
-    if weighted == ["reward"] and not data.reward_varies:
+    if not weighted or (weighted == ["reward"] and not data.reward_varies):
         raise nothing_varies(data, kind)
 
 

@@ -8,7 +8,6 @@ one episode, with the action between them.
 import math
 from typing import ClassVar
 
-from msgspec import field
 from torch import Tensor
 
 from jbrep.dataset import ScaledDataset
@@ -22,14 +21,7 @@ from jbrep.methods.vae import (
 )
 from jbrep.training.network import layers, stack
 from jbrep.training.objective import Layers, Objective
-from jbrep.training.settings import (
-    BatchSize,
-    Epochs,
-    FeatureWeights,
-    LearningRate,
-    Seed,
-    TransitionWeight,
-)
+from jbrep.training.settings import BatchSize, TransitionWeight
 from jbrep.training.windows import Windows
 
 _LEAST, _MOST = math.log(0.01), math.log(10)  # log standard deviation of a reconstruction
@@ -43,11 +35,7 @@ class LldVae(Variational, frozen=True, kw_only=True):
 
     beta: Beta = 1.0
     transition: TransitionWeight = 0.1
-    epochs: Epochs = 12
     batch_size: BatchSize = 1000
-    learning_rate: LearningRate = 1e-3
-    seed: Seed = 0
-    weights: FeatureWeights = field(default_factory=dict)
 
     def objective(self, data: ScaledDataset) -> Objective:
         return LldVaeObjective(self, data)
@@ -73,7 +61,6 @@ class LldVaeObjective(VariationalObjective):
         self.transition = stack((count, count, count * (3 + data.task.action_size)), "linear")
 
     def inputs(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """As `Windows.steps`."""
         return windows.steps(numbers)
 
     def step(self, code: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -102,7 +89,6 @@ class LldVaeObjective(VariationalObjective):
         return (error + self._beta * prior + self._transition_weight * ahead).mean()
 
     def _negative_log_likelihood(self, code: Tensor, rows: Tensor) -> Tensor:
-        """The negative log-likelihood of rows, (n,)."""
         mean, log_deviation = self.decoder(code).chunk(2, 1)
         log_deviation = log_deviation.clamp(_LEAST, _MOST)
         squares = ((rows - mean) / log_deviation.exp()).square() / 2
@@ -128,15 +114,8 @@ def transition_divergence(
 ) -> Tensor:
     """KL of N(m, A S A') from N(n, T), with A = I + v r', and S and T diagonal, (n,).
 
-    By det A = 1 + v' r nothing of size (l, l) is made (Watter et al. 2015, appendix).
-
-    Args:
-        mean: m, (n, l), as are all the others.
-        log_deviation: half the logarithm of S.
-        left: v.
-        right: r.
-        next_mean: n.
-        next_log_deviation: half the logarithm of T.
+    By det A = 1 + v' r nothing of size (l, l) is made (Watter et al. 2015, appendix). All are
+    (n, l): m, half the logarithm of S, v and r, n, half the logarithm of T.
     """
     variance, precision = (2 * log_deviation).exp(), (-2 * next_log_deviation).exp()
     spread = (right.square() * variance).sum(1, keepdim=True)

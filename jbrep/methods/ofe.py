@@ -1,5 +1,6 @@
 """OFENet: a code larger than the observation, from which the next observation follows."""
 
+import copy
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, cast
 
@@ -7,17 +8,16 @@ import numpy as np
 import torch
 from msgspec import Meta
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from jbrep.dataset import ScaledDataset
-from jbrep.encoders.layers import Layer
+from jbrep.encoders.layers import Layer, dense
 from jbrep.envs.task import Array
 from jbrep.errors import InputError
-from jbrep.methods.linear import dense
 from jbrep.training.method import Learned
 from jbrep.training.network import seeded
 from jbrep.training.objective import Layers, Objective
-from jbrep.training.settings import BatchSize, Epochs, LearningRate, Seed
-from jbrep.training.windows import Windows
+from jbrep.training.settings import LearningRate
 
 
 class OFE(Learned, frozen=True, kw_only=True):
@@ -29,10 +29,7 @@ class OFE(Learned, frozen=True, kw_only=True):
     blocks: Annotated[
         int, Meta(ge=1, le=32, description="Layers, each of which sees all that come before.")
     ] = 4
-    epochs: Epochs = 12
-    batch_size: BatchSize = None
     learning_rate: LearningRate = 1e-3
-    seed: Seed = 0
 
     def check_data(self, data: ScaledDataset) -> None:
         super().check_data(data)
@@ -49,11 +46,8 @@ class OFE(Learned, frozen=True, kw_only=True):
 class DenseBlocks(nn.Module):
     """Layers of which each adds units to all numbers before it (DenseNet): [x, h1, h2, ...].
 
-    A unit is silu(batch norm(w . numbers before)), as in OFENet.
-
-    Args:
-        size: numbers that the first layer takes.
-        widths: units that each layer adds.
+    A unit is silu(batch norm(w . numbers before)), as in OFENet. `widths` are the units that each
+    layer adds.
     """
 
     def __init__(self, size: int, widths: Sequence[int]):
@@ -79,7 +73,8 @@ class DenseBlocks(nn.Module):
         chain: list[Layer] = []
         restore: Array | None = None  # from what a layer gives to the numbers that it stands for
         for linear, norm in zip(self.linears, self.norms, strict=True):
-            weight, bias = _folded(linear, norm)
+            parts: Any = (copy.deepcopy(each).double().eval() for each in (linear, norm))
+            weight, bias = (p.numpy(force=True) for p in fuse_linear_bn_eval(*parts).parameters())
             same = np.eye(weight.shape[1])
             rows = np.vstack((same, -same, weight))
             shift = np.concatenate((np.zeros(2 * len(same)), bias))
@@ -102,23 +97,6 @@ def _normalised(norm: Any, units: Tensor) -> Tensor:
     return nn.functional.batch_norm(units, *running, norm.weight, norm.bias, eps=norm.eps)
 
 
-def _folded(linear: Any, norm: Any) -> tuple[Array, Array]:
-    """Weight and bias of a linear layer with its batch norm, in evaluation."""
-    weight, bias, mean, variance, scale, shift = (
-        each.detach().cpu().double().numpy()
-        for each in (
-            linear.weight,
-            linear.bias,
-            norm.running_mean,
-            norm.running_var,
-            norm.weight,
-            norm.bias,
-        )
-    )
-    factor = scale / np.sqrt(variance + norm.eps)
-    return weight * factor[:, None], (bias - mean) * factor + shift
-
-
 class OFEObjective(Objective):
     """The mean squared error of the next row, from features of row and action (Ota et al. 2020).
 
@@ -139,10 +117,6 @@ class OFEObjective(Objective):
             self.beside_action = DenseBlocks(inputs, widths)
             self.next_row = nn.Linear(inputs + sum(widths), data.size)
 
-    def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """As `Windows.steps`."""
-        return windows.steps(numbers)
-
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
         now, actions, after = batch
         known = self.beside_action(torch.cat((self.encoder(now), actions), 1))
@@ -150,7 +124,6 @@ class OFEObjective(Objective):
         return error
 
     def layers(self) -> tuple[Layers, Layers | None]:
-        """As for `Objective`; the decoder takes the row out of the code."""
         encoder = self.blocks.layers()
         rows = np.eye(self._size, len(encoder[-1].bias))
         return encoder, (dense(rows, np.zeros(self._size)),)

@@ -20,10 +20,8 @@ _WIDEST = 1 << 28  # products of a window, which are summed: 2 GiB
 class Block:
     """Windows that follow each other, with the rows that they share.
 
-    Args:
-        data: scaled.
-        starts: places, among the training rows, of the windows' first rows, (m,).
-        horizon: rows of a window after its first.
+    `starts` are the places of their first rows among the training rows, (m,), `horizon` is the
+    number of rows after these.
     """
 
     def __init__(self, data: ScaledDataset, starts: NDArray[np.int64], horizon: int):
@@ -71,9 +69,7 @@ def blocks(data: ScaledDataset, horizon: int, width: int, work: int) -> Iterator
         data: scaled.
         horizon: rows of a window after its first.
         width: numbers that the caller makes of each window, by which blocks are sized.
-        work: products that the caller makes of each window and sums. Where those of all windows
-            would be more than 10^12, as of 5 million rows of some hundreds of features, only so
-            many blocks are given.
+        work: products that the caller makes of each window; blocks of 10^12 are given at most.
     """
     if work > _WIDEST:
         raise InputError(
@@ -92,14 +88,9 @@ def blocks(data: ScaledDataset, horizon: int, width: int, work: int) -> Iterator
 
 
 def check_enough(count: int, width: int, data: ScaledDataset, apart: int, less: str) -> None:
-    """Make sure that there are more windows than numbers in each to regress on.
+    """Make sure that there are more windows than numbers in each, `width`, to regress on.
 
-    Args:
-        count: of windows.
-        width: numbers in each.
-        data: that they are of.
-        apart: steps from the first to the last row of a window.
-        less: what to give to have more windows, or fewer numbers.
+    They reach `apart` steps; `less` is what to give to have more windows, or fewer numbers.
     """
     if count <= width:
         raise InputError(

@@ -44,14 +44,8 @@ def each_named(
 ) -> list[tuple[str | None, dict[str, Any]]]:
     """The name and settings of several encoders: one of each latent size and seed.
 
-    A name that isn't given is left out where it needs no seed: data may say more of it.
-
-    Args:
-        kind: of all of them.
-        latents: their sizes; empty for one of a kind that has none.
-        seeds: n for one of each of the seeds 0 to n - 1; None for the usual one.
-        name: of the only one of each seed; None for what they are.
-        settings: of all of them.
+    A name that isn't given is left out where it needs no seed: data may say more of it. There are
+    no `latents` of a kind that has none, and the `seeds` are 0 to n - 1, or the usual one.
     """
     method = get_method(kind)
     if name and len(latents) > 1:

@@ -12,8 +12,7 @@ from jbrep.errors import InputError
 from jbrep.training.method import Learned, Network
 from jbrep.training.network import HIDDEN, get_architecture, seeded, stack
 from jbrep.training.objective import Objective
-from jbrep.training.settings import BatchSize, Epochs, LearningRate, Seed
-from jbrep.training.windows import Windows
+from jbrep.training.settings import Architecture
 
 
 class SelfPrediction(Network, Learned, frozen=True, kw_only=True):
@@ -21,10 +20,7 @@ class SelfPrediction(Network, Learned, frozen=True, kw_only=True):
 
     name: ClassVar[str] = "self-prediction"
 
-    epochs: Epochs = 12
-    batch_size: BatchSize = None
-    learning_rate: LearningRate = 2e-3
-    seed: Seed = 0
+    architecture: Architecture = "deep"
 
     def check_data(self, data: ScaledDataset) -> None:
         super().check_data(data)
@@ -63,10 +59,6 @@ class SelfPredictionObjective(Objective):
                 else:
                     nn.init.zeros_(parameter)
             self.next_code = stack((latent + actions, HIDDEN, HIDDEN, latent), "linear")
-
-    def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """As `Windows.steps`."""
-        return windows.steps(numbers)
 
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
         now, actions, after = batch

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.encoders.layers import Layer, run
+from jbrep.encoders.layers import Layer, dense, run
 from jbrep.envs.task import Array
-from jbrep.methods.linear import DEVIATION, dense, inverse_root
+from jbrep.methods.linear import DEVIATION, inverse_root
 from jbrep.training.method import Made
 from jbrep.training.objective import Layers
 
@@ -28,11 +28,7 @@ def complete(
 ) -> Complete:
     """What a method made, with the scale of its code, a decoder, and what passes around them.
 
-    Args:
-        made: by the method.
-        data: scaled.
-        codes: raw, standard or white.
-        keep: features that pass around the layers, unless the method says which.
+    `keep` names features that pass around the layers, unless the method says which.
     """
     encoder, decoder = made.encoder, made.decoder
     if not encoder:

@@ -7,11 +7,11 @@ the divergence weighs less, for cross-entropy hardly sees features of small spre
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
-from msgspec import Meta, field
+from msgspec import Meta
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
@@ -20,7 +20,7 @@ from jbrep.encoders.layers import Layer
 from jbrep.training.method import Network, Reconstructing
 from jbrep.training.network import get_architecture, layers, seeded, stack
 from jbrep.training.objective import Layers, Objective, feature_weights
-from jbrep.training.settings import BatchSize, Epochs, FeatureWeights, LearningRate, Seed, Weight
+from jbrep.training.settings import Architecture, BatchSize, Epochs, LearningRate, Weight
 from jbrep.training.windows import Windows
 
 _LEAST, _MOST = -7.0, 7.0  # log standard deviation of a posterior
@@ -31,8 +31,10 @@ Beta = Annotated[Weight, Meta(description="Weight of the divergence from the pri
 class Variational(Network, Reconstructing, frozen=True, kw_only=True):
     """A method whose code has a distribution."""
 
-    if TYPE_CHECKING:
-        beta: float
+    architecture: Architecture = "deep"
+    beta: Beta = 0.001
+    batch_size: BatchSize = 256
+    learning_rate: LearningRate = 1e-3
 
 
 class Vae(Variational, frozen=True, kw_only=True):
@@ -43,12 +45,7 @@ class Vae(Variational, frozen=True, kw_only=True):
 
     name: ClassVar[str] = "vae"
 
-    beta: Beta = 0.001
     epochs: Epochs = 5
-    batch_size: BatchSize = 256
-    learning_rate: LearningRate = 1e-3
-    seed: Seed = 0
-    weights: FeatureWeights = field(default_factory=dict)
 
     def objective(self, data: ScaledDataset) -> Objective:
         return VaeObjective(self, data)
@@ -99,14 +96,12 @@ class VariationalObjective(Objective):
         return (windows.rows(numbers),)
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """As for `Objective`, without noise."""
         inputs = self.inputs(windows, numbers)
         return *inputs, inputs[0].new_zeros(1, self._latent).expand(len(inputs[0]), -1)
 
     def draws(
         self, windows: Windows, numbers: Tensor, size: int, generator: torch.Generator
     ) -> Iterator[tuple[Tensor, ...]]:
-        """As for `Objective`, with noise."""
         *inputs, zeros = self.batch(windows, numbers)
         noise = torch.empty(zeros.shape, device=zeros.device).normal_(generator=generator)
         yield from zip(*(part.split(size) for part in (*inputs, noise)), strict=True)
@@ -139,11 +134,6 @@ def cross_entropy(logits: Tensor, rows: Tensor, weights: Tensor | None) -> Tenso
 
     Scaled values beyond [-1, 1], which held-out rows and scalings other than by extrema have, count
     as its ends: no sigmoid gives more, and beyond them the cross-entropy has no least value.
-
-    Args:
-        logits: of the reconstruction, (n, d).
-        rows: scaled, (n, d).
-        weights: of each number, (d,); None for 1.
     """
     target = ((rows + 1) / 2).clamp(0, 1)
     return binary_cross_entropy_with_logits(logits, target, weights, reduction="none")

@@ -12,7 +12,6 @@ from jbrep.envs.task import Array, Task, check_same
 from jbrep.errors import DamageError, InputError, first_line, refusing
 from jbrep.play.player import Player
 from jbrep.records.storage import read_file
-from jbrep.rl.policy_file import MAX_BYTES
 
 
 class Described(msgspec.Struct):
@@ -28,17 +27,14 @@ def read_exported(path: Path) -> tuple[Any, Described]:
     Raises:
         DamageError: it can't be read.
     """
-    import onnxruntime
+    from jbrep.encoders.imported import session  # imports onnx
 
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
     what = f"{path} isn't an ONNX model that can be run"
     with refusing(what, told=first_line, kind=DamageError):
-        session = onnxruntime.InferenceSession(read_file(path, MAX_BYTES), options)
-    text = session.get_modelmeta().custom_metadata_map.get("jbrep", "")
+        made = session(read_file(path))
+    text = made.get_modelmeta().custom_metadata_map.get("jbrep", "")
     try:
-        return session, msgspec.json.decode(text, type=Described)
+        return made, msgspec.json.decode(text, type=Described)
     except msgspec.DecodeError:  # also of a field that doesn't fit
         raise InputError(f"{path} isn't a policy that jbrep policy export wrote") from None
 

@@ -72,8 +72,7 @@ def turn_targets(lanes: Lanes, yaw: float) -> None:
     turned = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
     targets = {"target_quaternion": np.tile(turned, (lanes.num_lanes, 1))}
     simulation.restore(**simulation.state | targets)
-    seen = simulation.observe()
-    lanes.restore(lanes.state | {"observation": seen, "last_observation": seen})
+    lanes.observation = lanes.envs.look()
 
 
 def hold_diverged(task: Task, motion: Motion) -> Motion:

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from msgspec import UNSET, Meta
 
+from jbrep.envs.description import changeable, with_domain
 from jbrep.envs.domain import NAMES, Domain, read_ranges
-from jbrep.envs.randomized import changeable, with_domain
 from jbrep.envs.task import Id, Task
 from jbrep.errors import InputError
 from jbrep.play.player import Player
@@ -51,7 +51,7 @@ class Table(Document, frozen=True, kw_only=True):
     """What a policy returns from the same starts in several domains, the first one undisturbed."""
 
     format = "jbrep perturbations"
-    format_version = 1
+    format_version = 2
 
     policy: Line
     task: Id  # its name

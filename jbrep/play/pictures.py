@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from jbrep.envs.mujoco import root_of
-from jbrep.envs.physics import Motion
+from jbrep.envs.physics import Motion, root_of
 from jbrep.errors import InputError, choose
 from jbrep.opengl import no_opengl, prepare_opengl
 

@@ -7,8 +7,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from jbrep.envs.lanes import Lanes
-from jbrep.envs.make import reason
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 from jbrep.play.pictures import Camera
 from jbrep.play.rollout import Rollout
 
@@ -109,7 +108,7 @@ class Drawn:
         try:
             (drawn,) = lanes.render()
         except Exception as error:  # whatever the environment raises
-            raise self._not_drawn(f"its render() fails: {reason(error)}") from error
+            raise self._not_drawn(f"its render() fails: {kind_and_line(error)}") from error
         picture: Any = np.asarray(drawn)
         if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
             given = f"{picture.dtype} {picture.shape}" if picture.ndim else repr(drawn)

@@ -13,10 +13,8 @@ from msgspec import Meta
 _SECONDS = 5
 CHANGES = "+changes"
 Commits = Mapping[
-    Annotated[str, Meta(pattern=r"\A(jbrep|work)\Z", title="jbrep or work")],
-    Annotated[
-        str, Meta(pattern=rf"\A[0-9a-f]{{40,64}}({re.escape(CHANGES)})?\Z", title="a git commit")
-    ],
+    Annotated[str, Meta(pattern=r"\A(jbrep|work)\Z")],
+    Annotated[str, Meta(pattern=rf"\A[0-9a-f]{{40,64}}({re.escape(CHANGES)})?\Z")],
 ]
 
 
@@ -24,12 +22,10 @@ Commits = Mapping[
 def commits() -> Commits:
     """The last commits of jbrep's code and of the working directory, where git knows them.
 
-    That of a folder is the last one that changed a file there, so that a commit of something else,
-    such as a registration, leaves it as it was. It is 40 hexadecimal digits (64 with SHA-256), with
-    "+changes" after them if files that git tracks differ from it. They are those of the first call
-    in a process.
+    That of a folder is the last one that changed a file there. "+changes" stands after it if files
+    that git tracks differ from it. They are those of the first call in a process.
     """
-    places = {"jbrep": Path(__file__).resolve().parent, "work": Path.cwd()}
+    places = {"jbrep": Path(__file__).resolve().parents[1], "work": Path.cwd()}
     known = {name: _commit(folder) for name, folder in places.items()}
     return MappingProxyType({name: commit for name, commit in known.items() if commit})
 
@@ -47,7 +43,6 @@ def is_committed(path: Path) -> bool:
 
 
 def _commit(folder: Path) -> str:
-    """The last commit that changed a folder; empty if there is none, or no git."""
     if "site-packages" in folder.parts:
         return ""  # installed in an environment that may lie in another project's repository
     commit = _git(folder, "log", "-1", "--format=%H", "--", ".")

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from jbrep.errors import DamageError, InputError
-from jbrep.records.storage import MissingFileError, open_regular, read_regular, write_whole
+from jbrep.records.storage import MissingFileError, read_file, write_whole
 
 Tensors = dict[str, NDArray[Any]]
 
-MAX_BYTES = 1 << 24  # that `read` accepts unless told otherwise
-_MAX_HEADER = 100_000_000  # bytes, as safetensors has it
 _KEY = "jbrep"  # of the header in the file's metadata
 _CHECKSUM = "sha256"  # of the rest of the header and all tensors, in the header
+_MALFORMED = (SafetensorError, ValueError, KeyError, TypeError, RecursionError)
 
 
 def write(path: Path, tensors: Tensors, header: Mapping[str, Any]) -> None:
@@ -44,43 +43,29 @@ def checksum(tensors: Tensors, header: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def read(path: Path, what: str, most: int = MAX_BYTES) -> tuple[Tensors, dict[str, Any]]:
+def read(path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
     """Tensors and header of such a file, once its checksum has been verified.
 
     Args:
         path: the file.
         what: it should be, for messages, such as "encoder".
-        most: bytes that it may have.
 
     Raises:
-        DamageError: it isn't what was written, or has no checksum.
+        DamageError: it isn't what was written.
     """
     try:
-        raw = read_regular(path, most)
+        return unpack(read_file(path), path, what)
     except MissingFileError:
         raise InputError(f"no {what} at {path}") from None
-    if not raw:
-        raise InputError(
-            f"{path} is not a jbrep {what}: it must be a regular file of 1 to {most:,} bytes"
-        )
-    return unpack(raw, path, what)
 
 
 def unpack(raw: bytes, path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
-    """What `pack` made bytes of, as `read` returns it; the path is for messages.
-
-    Raises:
-        DamageError: it isn't what was written, or has no checksum.
-    """
+    """What `pack` made bytes of, as `read` returns it; the path is for messages."""
     try:
         tensors, header = safetensors.numpy.load(raw), _header(raw)
-    except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except _MALFORMED as error:
         raise InputError(f"{path} is not a jbrep {what}, or is truncated: {error}") from None
-    if _CHECKSUM not in header:
-        raise DamageError(
-            f"{path} has no checksum, so an older jbrep wrote it: delete it to start over"
-        )
-    if header.pop(_CHECKSUM) != checksum(tensors, header):
+    if header.pop(_CHECKSUM, None) != checksum(tensors, header):
         raise DamageError(
             f"{path} is damaged (its checksum doesn't match): delete it to start over"
         )
@@ -90,27 +75,20 @@ def unpack(raw: bytes, path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
 def peek(path: Path) -> dict[str, Any]:
     """The header of such a file, by no checksum; empty for any other file."""
     try:
-        file = open_regular(path)
-        if file is None:
-            return {}
-        with file:
+        with path.open("rb") as file:
             start = file.read(8)
-            start += file.read(min(int.from_bytes(start, "little"), _MAX_HEADER))
-        header = _header(start)
-        header.pop(_CHECKSUM, None)
-        return header
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            header = _header(start + file.read(int.from_bytes(start, "little")))
+    except (OSError, OverflowError, MemoryError, *_MALFORMED):
         return {}
+    header.pop(_CHECKSUM, None)
+    return header
 
 
 def _header(raw: bytes) -> dict[str, Any]:
-    """The header, from bytes that safetensors has found well-formed."""
     length = int.from_bytes(raw[:8], "little")
-    text = json.loads(raw[8 : 8 + length])["__metadata__"][_KEY]
-    header = json.loads(text)
-    if not isinstance(header, dict) or json.dumps(header) != text:
-        raise TypeError("its header is not in the form that jbrep writes")
-    json.dumps(header, ensure_ascii=False).encode()  # half a character can't be written again
+    header = json.loads(json.loads(raw[8 : 8 + length])["__metadata__"][_KEY])
+    if not isinstance(header, dict):
+        raise TypeError("its header is not an object")
     return header
 
 

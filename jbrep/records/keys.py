@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec import NODEFAULT, UNSET, inspect
 
-from jbrep.records.record import Record, default_of
-from jbrep.records.words import described, type_of
+from jbrep.records.record import Record, default_of, type_of
 
 
 class Key(NamedTuple):
@@ -23,13 +22,14 @@ class Key(NamedTuple):
     @property
     def default_shown(self) -> str:
         """The default for a reader; empty where there is none, or it says nothing."""
-        if self.default_in_words or self.default in (NODEFAULT, UNSET, None, ""):
+        value = self.default
+        if self.default_in_words or value in (NODEFAULT, UNSET, None, ""):
             return self.default_in_words
-        if isinstance(self.default, Record | dict | tuple | frozenset):
+        if isinstance(value, Record | dict | tuple | frozenset):
             return ""
-        if isinstance(self.default, bool):
-            return str(self.default).lower()
-        return f"{self.default:,}" if isinstance(self.default, int) else str(self.default)
+        if isinstance(value, bool):
+            return str(value).lower()
+        return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def keys_of(kind: type[Record]) -> list[Key]:
@@ -39,23 +39,23 @@ def keys_of(kind: type[Record]) -> list[Key]:
     """
     node = type_of(kind)
     assert isinstance(node, inspect.StructType)
-    return [
-        Key(
-            each.encode_name,
-            each.name,
-            each.type,
-            field.type,
-            default_of(field),
-            *_words(each.type),
+    keys = []
+    for each, field in zip(node.fields, msgspec.structs.fields(kind), strict=True):
+        told = each.type if isinstance(each.type, inspect.Metadata) else None
+        words = (told and told.extra_json_schema) or {}
+        extra = (told and told.extra) or {}
+        keys.append(
+            Key(
+                each.encode_name,
+                each.name,
+                each.type,
+                field.type,
+                default_of(field),
+                words.get("description", ""),
+                str(extra.get("default", "")),
+            )
         )
-        for each, field in zip(node.fields, msgspec.structs.fields(kind), strict=True)
-    ]
-
-
-def _words(node: inspect.Type) -> tuple[str, str]:
-    """A field's help, and its default in words."""
-    extra = node.extra or {} if isinstance(node, inspect.Metadata) else {}
-    return described(node).get("description", ""), str(extra.get("default", ""))
+    return keys
 
 
 def option_name(key: str) -> str:

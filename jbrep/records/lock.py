@@ -3,7 +3,7 @@
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -14,9 +14,7 @@ from jbrep.errors import InputError
 
 @contextmanager
 def exclusive(path: Path, *, beside: bool = False, wait: float = 0) -> Iterator[None]:
-    """Be the only writer in a folder, which has a file `.lock` for as long.
-
-    The lock is released when its process ends, even where that was killed and left the file.
+    """Be the only writer in a folder, which has a file `.lock` until the process ends or lets go.
 
     Args:
         path: the folder; with `beside`, a file or folder that may not exist yet.
@@ -26,15 +24,16 @@ def exclusive(path: Path, *, beside: bool = False, wait: float = 0) -> Iterator[
     if beside and not path.name:
         raise InputError(f"{path} can't be a new file or folder: give it a name")
     note = path.with_name(f".{path.name}.lock") if beside else path / ".lock"
-    lock = filelock.FileLock(note)
-    now = datetime.now().astimezone().isoformat(" ", "seconds")
+    lock, holder = filelock.FileLock(note), ""
     try:
         lock.acquire(timeout=wait)
+        now = datetime.now().astimezone().isoformat(" ", "seconds")
         note.write_text(f"process {os.getpid()} on {socket.gethostname()} since {now}")
     except filelock.Timeout:
-        raise InputError(
-            f"{path} is being written by {_holder(note)}: wait for it or stop it"
-        ) from None
+        with suppress(OSError):  # released and removed meanwhile
+            holder = note.read_text()
+        who = holder or "another process"
+        raise InputError(f"{path} is being written by {who}: wait for it or stop it") from None
     except OSError as error:
         lock.release()
         raise InputError(f"can't write in {note.parent}: {error.strerror or error}") from error
@@ -43,10 +42,3 @@ def exclusive(path: Path, *, beside: bool = False, wait: float = 0) -> Iterator[
     finally:
         note.unlink(missing_ok=True)  # filelock notices that a lock it gets was removed
         lock.release()
-
-
-def _holder(path: Path) -> str:
-    try:
-        return path.read_text() or "another process"
-    except OSError:  # released and removed meanwhile
-        return "another process"

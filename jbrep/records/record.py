@@ -4,13 +4,14 @@ A field says its type, its range and its words once::
 
     steps: Annotated[int, Meta(ge=1, le=10**12, description="Of training.")] = 100_000
 
-From that follow the check of each value that is given, with a message of one line, the JSON that
-files hold, the options of the command line and the tables in docs/. msgspec reads the types:
+From that follow the check of each value that is given, the JSON that files hold, the options of the
+command line and the tables in docs/. msgspec reads the types:
 https://jcristharif.com/msgspec/constraints.html
 """
 
 import re
 import sys
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Self, TypeVar
 
 import msgspec
@@ -18,25 +19,22 @@ from msgspec import NODEFAULT, UNSET, Meta, inspect
 from msgspec.structs import force_setattr
 
 from jbrep.errors import InputError
-from jbrep.records.words import at, bare, must_be, type_of
 from jbrep.text import printable
 
 _Kind = TypeVar("_Kind")
 
 MOST_WHOLE = 1 << 53  # that floats hold, as they do all whole numbers below
-_LARGEST = sys.float_info.max
-Finite = Annotated[float, Meta(ge=-_LARGEST, le=_LARGEST, title="a finite number")]
+Finite = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+Version = Annotated[str, Meta(pattern=r"(?a)\A\w[\w.+!-]*\Z")]  # or the name of a package
+Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z")]
 
-Version = Annotated[
-    str,
-    Meta(pattern=r"(?a)\A\w[\w.+!-]*\Z", title="a version, or the name of a package"),
-]
-Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="64 hexadecimal digits")]
-
-_AT = re.compile(r"(?P<reason>.*?)(?: - at `\$(?P<path>.*)`)?", re.DOTALL)
-_MISSING = re.compile(r"Object missing required field `(.*)`")
-_UNKNOWN = re.compile(r"Object contains unknown field `(.*)`")
-_OF_MSGSPEC = re.compile(r"Expected |Invalid |Number out of range|Integer value out of range")
+_MESSAGE = re.compile(r"(.*?)(?: - at `\$(.*)`)?", re.DOTALL)  # msgspec's, and where
+_FIELD = re.compile(r"Object (missing required|contains unknown) field `(.*)`")
+_STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]")
+_WITH_PARTS = (
+    *(inspect.StructType, inspect.NamedTupleType, inspect.DictType),
+    *(inspect.CollectionType, inspect.TupleType),
+)
 _MOST_SHOWN = 60  # letters of a value
 
 
@@ -90,9 +88,85 @@ def converted(value: Any, kind: Any, where: str, strict: bool = True) -> Any:
     try:
         return msgspec.convert(value, kind, strict=strict)
     except msgspec.ValidationError as error:
-        raise InputError(_said(str(error), value, kind, where)) from None
+        raise InputError(_line(str(error), value, kind, where)) from None
     except RecursionError:
         raise InputError(f"{where or 'it'} must be nested less deeply") from None
+
+
+def _line(message: str, value: Any, kind: Any, where: str) -> str:
+    """A message of msgspec's as a line with the place, the value and what that must be."""
+    found = _MESSAGE.fullmatch(message)
+    reason, path = found.groups("") if found else (message, "")
+    place = f"{where}{path}".removeprefix(".")
+    nodes = [*_plain([type_of(kind)])]
+    for field, index in _STEP.findall(path):
+        nodes = [*_plain(part for each in nodes for part in _parts(each, field or index))]
+        value = _inside(value, field or index)
+    if field := _FIELD.fullmatch(reason):
+        name = f"{place}.{field[2]}" if place else field[2]
+        is_missing = field[1].startswith("missing")
+        return (
+            f"{name} is missing" if is_missing else f"unknown {name}: it must be {_choices(nodes)}"
+        )
+    if reason.startswith("Expected "):
+        must_be = reason.removeprefix("Expected ").partition(", got")[0]
+    elif reason.startswith("Invalid "):
+        must_be = _choices(nodes)
+    else:  # what `check` said
+        return f"{place}: {reason}" if place else reason
+    given = "" if value is UNSET else f" is {shown(value)}: it"
+    return f"{place or 'it'}{given} must be {must_be}"
+
+
+def _inside(value: Any, step: str) -> Any:
+    """A part of a value; UNSET of one in a dict, which msgspec doesn't name."""
+    try:
+        return value[int(step) if isinstance(value, list | tuple) else step]
+    except (LookupError, TypeError, ValueError):
+        return getattr(value, step, UNSET)
+
+
+def _plain(nodes: Iterable[inspect.Type]) -> Iterator[inspect.Type]:
+    """Types without their descriptions; of a union its parts."""
+    for node in nodes:
+        match node:
+            case inspect.Metadata(type=inner):
+                yield from _plain([inner])
+            case inspect.UnionType(types=types):
+                yield from _plain(types)
+            case _:
+                yield node
+
+
+def _parts(node: inspect.Type, step: str) -> list[inspect.Type]:
+    """The types that a part of a value may have, of that field or at that place."""
+    match node:
+        case inspect.StructType(array_like=True, fields=fields):
+            return [fields[int(step)].type]
+        case inspect.StructType(tag_field=tag_field, tag=tag) if step == tag_field:
+            return [inspect.LiteralType((tag,))]
+        case inspect.StructType(fields=fields):
+            return [each.type for each in fields if each.encode_name == step]
+        case inspect.CollectionType(item_type=item) | inspect.DictType(value_type=item):
+            return [item]
+    return []
+
+
+def _choices(nodes: Sequence[inspect.Type]) -> str:
+    """The values, or else the names of fields, among which there is a choice."""
+    values = [each for node in nodes for each in getattr(node, "values", ())]
+    fields = (each for node in nodes for each in getattr(node, "fields", ()))
+    return f"one of {', '.join(map(str, values or dict.fromkeys(f.encode_name for f in fields)))}"
+
+
+def type_of(kind: Any) -> inspect.Type:
+    """A type as msgspec sees it."""
+    return inspect.type_info(kind)
+
+
+def bare(node: inspect.Type) -> inspect.Type:
+    """A type without its description; of a union a list or table, or else the first part."""
+    return max(_plain([node]), key=lambda each: isinstance(each, _WITH_PARTS))
 
 
 def to_plain(value: Any) -> Any:
@@ -117,42 +191,12 @@ def _with_lists(value: Any) -> Any:
     return [_with_lists(each) for each in value] if isinstance(value, list | tuple) else value
 
 
-def _said(message: str, value: Any, kind: Any, where: str) -> str:
-    """An error of msgspec's as a line for people."""
-    found = _AT.fullmatch(message)
-    reason, path = (found["reason"], found["path"] or "") if found else (message, "")
-    part = at(value, kind, path)
-    name = f"{where}{part.name}".removeprefix(".")
-    if missing := _MISSING.fullmatch(reason):
-        return f"{_inside(name, missing[1])} is missing"
-    if unknown := _UNKNOWN.fullmatch(reason):
-        names = f"it must be one of {', '.join(part.names)}" if part.names else "there are none"
-        return f"unknown {_inside(name, unknown[1])}: {names}"
-    if not _OF_MSGSPEC.match(reason):  # what `check` said
-        return f"{name}: {reason}" if name else reason
-    if part.value is UNSET:
-        return f"{name} must be {must_be(part.kind)}"
-    return f"{name or 'it'} is {shown(part.value)}: it must be {must_be(part.kind)}"
-
-
-def _inside(name: str, field: str) -> str:
-    return f"{name}.{field}" if name else field
-
-
 def shown(value: Any) -> str:
     """A value in a message: short, on one line, and with nothing that controls a terminal."""
-    text = value if isinstance(value, str) else ascii(_plain_or_text(value))
+    text = value if isinstance(value, str) else ascii(value)
     text = printable(text)
     text = text if len(text) <= _MOST_SHOWN else f"{text[: _MOST_SHOWN - 3]}..."
     return repr(text) if isinstance(value, str) else text
-
-
-def _plain_or_text(value: Any) -> Any:
-    """A value as plain JSON where that can be."""
-    try:
-        return to_plain(value)
-    except (TypeError, ValueError, RecursionError):
-        return f"of type {type(value).__name__}"
 
 
 def default_of(field: msgspec.structs.FieldInfo) -> Any:

@@ -9,13 +9,12 @@ from typing import Any, NamedTuple, TypeVar
 
 from jbrep.errors import DamageError
 from jbrep.records.record import MOST_WHOLE
-from jbrep.records.storage import exists, read_regular, write_whole
+from jbrep.records.storage import read_file, write_whole
 
 _Row = TypeVar("_Row", bound=NamedTuple)
 Columns = Mapping[str, Callable[[str], Any]]  # by their names: what their cells are
 
-_MAX_BYTES = 1 << 28
-_LARGEST = 1e100  # number whose square is one, too
+_LARGEST = 1e100
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -28,15 +27,13 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Write a table, whole or not at all, unless it is there already; returns its SHA-256."""
+    """Write a table, whole or not at all; returns its SHA-256."""
     return write_text(path, csv_text(columns, rows))
 
 
 def write_text(path: Path, text: str) -> str:
     """The same of a table as text."""
-    content = text.encode()
-    if not exists(path) or read_regular(path, _MAX_BYTES) != content:
-        write_whole(path, content)
+    write_whole(path, text.encode())
     return hash_of(text)
 
 
@@ -60,9 +57,9 @@ def read_csv(
         further: what cells of all other columns are; each row then ends with a dictionary of them.
 
     Raises:
-        DamageError: it isn't such a table, or has another SHA-256.
+        DamageError: it is another table.
     """
-    raw = read_regular(path, _MAX_BYTES)
+    raw = read_file(path)
     if sha256 is not None and hashlib.sha256(raw).hexdigest() != sha256:
         raise DamageError(
             f"{path} was changed after it was written, or is damaged: its checksum doesn't match"
@@ -82,11 +79,7 @@ def read_csv(
 
 
 def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -> str:
-    """Write a table whose columns are the fields of its rows: text, counts and numbers.
-
-    Returns:
-        Its SHA-256.
-    """
+    """As `write_csv`, of columns that are the fields of rows: text, counts and numbers."""
     return write_csv(path, [*map(_column, kind._fields)], ([*map(_cell, row)] for row in rows))
 
 
@@ -113,11 +106,7 @@ def _column(field: str) -> str:
 
 
 def count(cell: str) -> int:
-    """A whole number from 0.
-
-    Raises:
-        ValueError: it is something else.
-    """
+    """A whole number from 0, or a ValueError."""
     number = int(cell)
     if not 0 <= number < MOST_WHOLE:
         raise ValueError
@@ -125,11 +114,7 @@ def count(cell: str) -> int:
 
 
 def finite(cell: str) -> float:
-    """A number.
-
-    Raises:
-        ValueError: it is something else, or so large that squares are infinite.
-    """
+    """A number, or a ValueError of one so large that its square is infinite."""
     number = float(cell)
     if not abs(number) <= _LARGEST:
         raise ValueError

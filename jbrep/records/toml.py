@@ -1,6 +1,5 @@
 """TOML files, as users write them."""
 
-import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,15 +8,11 @@ from typing import Any
 from jbrep.errors import InputError
 from jbrep.records.storage import read_file
 
-_MAX_BYTES = 1 << 20
-
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The contents of a TOML file, or of the one that a link leads to."""
-    is_possible = "\0" not in str(path)  # or else it is refused as it is read
-    content = read_file(Path(os.path.realpath(path)) if is_possible else path, _MAX_BYTES)
+    """The contents of a TOML file."""
     try:
-        return tomllib.loads(content.decode())
+        return tomllib.loads(read_file(path).decode())
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid TOML: {error}") from None
 

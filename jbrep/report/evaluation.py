@@ -1,15 +1,14 @@
-"""An evaluation of encoders as tables to read on a screen."""
+"""An evaluation of encoders to read on a screen: which code to take, and what each lacks."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 from jbrep.encoders import FULL
-from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Score, Scores
-from jbrep.evaluate.table import SCALARS, Scalar
+from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Lost, Score
+from jbrep.evaluate.table import SCALARS
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.report.serving import falling_short, lacking, serving, unreadable, untold
-from jbrep.text import SIGNIFICANT, Table, counted, facts, html, number, r2_text, wrapped
-
-_Encoders = Mapping[str, Diagnostics]  # by label
+from jbrep.report.views import say
+from jbrep.text import SIGNIFICANT, Table, facts, html, number, r2_text, wrapped
 
 _WORDS = {
     "orientation_w": "yaw",
@@ -21,133 +20,137 @@ _WORDS = {
     "angular_velocity_y": "rate of tilt",
     "angular_velocity_z": "rate of yaw",
 }
+_MEASURES = {  # of which the first that the full observation tells anything of counts
+    "rewarded": "the change of what the reward depends on",
+    "reward": "the reward",
+    "mean": "the features' change",
+}
+_TOLD = 0.1  # R² of it from the full observation, at least
+_AS_GOOD = 0.9  # the share of the best R² from which a code serves as well
+_MANY = 8  # features that are named
+_CHOSEN_BY = "rewarded"  # whose interval is shown
 
-_LACKING = "What each lacks of what a controller needs (R² of reading it below .5)"
-_NOTHING_NOW = "nothing: it can all be read now, but what becomes of it less well"
-_MANY = 8  # quantities from which probes are summed up
+
+class Judged(NamedTuple):
+    """Which codes should serve a controller.
+
+    Attributes:
+        by: what decides, in words.
+        serving: the codes that should, the best first.
+        take: the smallest of these, if possible one that lacks nothing.
+        nearest: where none serves, the one that comes nearest, if one does.
+        unsaid: why nothing can be said; empty where something can.
+    """
+
+    by: str
+    serving: Sequence[str] = ()
+    take: str | None = None
+    nearest: str | None = None
+    unsaid: str = ""
 
 
 def evaluation_text(
     evaluation: Evaluation, width: int | None = None, everything: bool = False
 ) -> str:
     """Which code to take and what each lacks, in lines of that width; everything else if wanted."""
-    parts = [
-        part.text(width) if isinstance(part, Table) else part for part in _parts(evaluation, width)
-    ]
-    if everything:
-        tables = _readings(evaluation.encoders), _scores(evaluation.encoders)
-        parts += [each.text(width) for each in tables]
-        parts.append(_words(evaluation, width))
-    return "\n\n".join(parts)
+    parts = [*_parts(evaluation, width), *(_everything(evaluation, width) if everything else ())]
+    return "\n\n".join(
+        part.text(width) if isinstance(part, Table) else part for part in parts if part
+    )
 
 
 def evaluation_html(evaluation: Evaluation) -> str:
     """Which code to take and what each lacks, for a notebook."""
-    return html(*_parts(evaluation, None))
+    return html(*(part for part in _parts(evaluation, None) if part))
 
 
 def _parts(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
-    """What tells codes that serve from others."""
-    yield wrapped(serving(evaluation), width)
-    yield _headline(evaluation)
-    yield from _unseen(evaluation)
-    yield _lacking(evaluation, width)
+    judged = judge(evaluation)
+    yield wrapped(say("advice", judged), width)
+    yield _headline(evaluation, judged)
+    yield from _hidden(evaluation)
+    yield _lacks_text(evaluation, width)
 
 
-def _headline(evaluation: Evaluation) -> Table:
+def judge(evaluation: Evaluation) -> Judged:
+    """By what can be predicted from each code, beside the best, the full observation among them."""
+    horizon = evaluation.encoders[FULL].horizon
+    for name in _MEASURES:
+        scores = {label: known.ahead(name) for label, known in evaluation.encoders.items()}
+        r2 = {label: (score and score.value) or 0.0 for label, score in scores.items()}
+        if r2[FULL] >= _TOLD:
+            break
+    else:
+        nothing = (
+            f"of these {evaluation.data.test_rows:,} held-out steps even the full observation "
+            "tells next to nothing of what comes next"
+        )
+        return Judged("", unsaid=nothing if horizon else untold(evaluation))
+    by = f"R² of {_MEASURES[name]} over {horizon} steps, at least {_AS_GOOD:.0%} of the best"
+    lacks, least = lacking(evaluation), _AS_GOOD * max(r2.values())
+    codes = sorted((label for label in r2 if label != FULL), key=lambda label: -r2[label])
+    serving = [label for label in codes if r2[label] >= least]
+    telling = [label for label in codes if r2[label] >= _TOLD]
+    nearest = min(telling, key=lambda label: bool(lacks[label]), default=None)
+    whole = [label for label in serving if not lacks[label]]
+    size = {label: evaluation.encoders[label].latent for label in serving}
+    return Judged(by, serving, min(whole or serving, key=size.__getitem__, default=None), nearest)
+
+
+def _headline(evaluation: Evaluation, judged: Judged) -> Table:
     """What tells codes that serve from others: columns of which anything is known."""
-    data, encoders = evaluation.data, evaluation.encoders
-    shown = [
-        each
-        for each in SCALARS.values()
-        if each.is_first and any(_value(each, e) is not None for e in encoders.values())
+    encoders = evaluation.encoders
+    first = [name for name, scalar in SCALARS.items() if scalar.is_first]
+    names = [n for n in first if any(_score(e, n).value is not None for e in encoders.values())]
+    serves = dict.fromkeys(encoders, "no") | dict.fromkeys(judged.serving, "yes") | {FULL: "-"}
+    rows = [
+        (
+            *(label, str(known.latent), *(_r2(known, name) for name in names)),
+            "-" if judged.unsaid else serves[label],
+        )
+        for label, known in encoders.items()
     ]
-    return Table(
-        f"R² on {counted(data.test_episodes, 'held-out episode')} ({data.test_rows:,} steps), "
-        "nonlinear (1: all, 0: nothing)",
-        ("encoder", "size", *(each.name for each in shown)),
-        [
-            (label, str(e.latent), *(_told(each.read(e), each.name) for each in shown))
-            for label, e in encoders.items()
-        ],
-    )
+    title = say("headline", evaluation, judged)
+    return Table(title, ("encoder", "size", *names, "serves"), rows)
 
 
-def _value(scalar: Scalar, known: Diagnostics) -> float | None:
-    score = scalar.read(known)
-    return score.value if score else None
+def _score(known: Diagnostics, name: str) -> Score:
+    return SCALARS[name].read(known) or Score(None)
 
 
-def _told(score: Score | None, name: str) -> str:
+def _r2(known: Diagnostics, name: str) -> str:
     """An R² of the headline; that by which codes are chosen with its interval."""
-    value, low, high = score or Score(None)
-    is_chosen_by = name == "rewarded" and low is not None
+    value, low, high = _score(known, name)
+    is_chosen_by = name == _CHOSEN_BY and low is not None
     return r2_text(value) + (f" [{r2_text(low)}, {r2_text(high)}]" if is_chosen_by else "")
 
 
-def _unseen(evaluation: Evaluation) -> Iterator[Table]:
+def _hidden(evaluation: Evaluation) -> Iterator[Table]:
     """How well what isn't seen can be read from each code, where the truth is known."""
+    codes = evaluation.encoders.values()
     if hidden := evaluation.data.hidden:
-        yield Table(
-            "What isn't seen, read from the code: R², nonlinear",
-            ("feature", *evaluation.encoders),
-            [
-                (
-                    name,
-                    *(
-                        r2_text(e.nonlinear_probes[name].value)
-                        for e in evaluation.encoders.values()
-                    ),
-                )
-                for name in hidden
-            ],
-        )
+        rows = [(n, *(r2_text(e.nonlinear_probes[n].value) for e in codes)) for n in hidden]
+        title = "What isn't seen, read from the code: R², nonlinear"
+        yield Table(title, ("feature", *evaluation.encoders), rows)
 
 
-def _words(evaluation: Evaluation, width: int | None) -> str:
-    """What each diagnostic is; of the headline for as many steps as episodes allow."""
-    words = {each.name: each.words for each in SCALARS.values()}
-    steps = evaluation.encoders[FULL].horizon
-    short = f"\nEpisodes allow to look {steps} steps ahead in place of 10." if steps != 10 else ""
-    return facts(words, width, indent=0) + short
-
-
-def _lacking(evaluation: Evaluation, width: int | None) -> str:
+def _lacks_text(evaluation: Evaluation, width: int | None) -> str:
     """What each code lacks of what a controller needs, as far as that can be said."""
-    unsaid = _unsaid(evaluation, width)
-    if untold(evaluation):
-        return "\n".join(unsaid)
-    short = falling_short(evaluation)
-    lines = {
-        label: lacks or (_NOTHING_NOW if label in short else "nothing")
-        for label, lacks in _lacks(evaluation).items()
-    }
-    told = facts(lines, width, indent=0)
-    return "\n".join((wrapped(_LACKING, width), told, *unsaid))
-
-
-def _lacks(evaluation: Evaluation) -> dict[str, str]:
-    """What each code lacks, in words."""
-    task = evaluation.data.task
-    lines = {}
+    if reason := untold(evaluation):
+        return wrapped(f"What each lacks can't be said: {reason}.", width)
+    told, task = {}, evaluation.data.task
     for label, features in lacking(evaluation).items():
         said: dict[str, float] = {}
         for each in features:
             said.setdefault(in_words(task, each.name), each.kept)
-        more = len(said) - _MANY
-        some = [f"{words} ({r2_text(kept)})" for words, kept in list(said.items())[:_MANY]]
-        lines[label] = ", ".join(some) + (f" and {more} more" if more > 0 else "")
-    return lines
-
-
-def _unsaid(evaluation: Evaluation, width: int | None) -> list[str]:
-    """Why it can't be said what each lacks, or what not even the full observation tells."""
-    if reason := untold(evaluation):
-        return [wrapped(f"What each lacks can't be said: {reason}.", width)]
-    task = evaluation.data.task
-    unread = dict.fromkeys(in_words(task, each.name) for each in unreadable(evaluation))
-    nor = f"Not even from the full observation can be read here: {', '.join(unread)}."
-    return [wrapped(nor, width)] if unread else []
+        some = [f"{words} ({r2_text(kept)})" for words, kept in [*said.items()][:_MANY]]
+        more = [f"{len(said) - _MANY} more"] if len(said) > _MANY else []
+        told[label] = ", ".join((*some, *more)) or "nothing"
+    unread = dict.fromkeys(in_words(task, each.name) for each in evaluation.encoders[FULL].loses)
+    title = wrapped("What each lacks of what a controller needs (R² of reading it below .5)", width)
+    nor = f"Nor can the full observation tell {', '.join(unread)}."
+    lines = [title, facts(told, width, indent=0)] if told else []
+    return "\n".join((*lines, *([wrapped(nor, width)] if unread else ())))
 
 
 def in_words(task: str, feature: str) -> str:
@@ -156,37 +159,35 @@ def in_words(task: str, feature: str) -> str:
     return words.get(feature, feature)
 
 
-def _readings(encoders: _Encoders) -> Table:
-    probes = {label: _probes(known.probes) for label, known in encoders.items()}
-    return Table(
-        "What can be read from the latent: R² of linear probes",
-        ("encoder", *probes[FULL]),
-        [(label, *probes[label].values()) for label in encoders],
-    )
+def untold(evaluation: Evaluation) -> str:
+    """Why nothing is known of what a controller needs; empty if something is."""
+    full = evaluation.encoders[FULL].prediction
+    if any(evaluation.needs.values()):
+        return ""
+    if not full:
+        return "episodes are too short to look ahead"
+    if all(ahead.reward.value is None for ahead in full.values()):
+        return "no reward is known that varies over the held-out steps, and no --policy is given"
+    return "the reward of these steps can't be predicted, and no --policy says what it looks at"
 
 
-def _scores(encoders: _Encoders) -> Table:
-    """All diagnostics but those of the headline."""
-    others = [each for each in SCALARS.values() if not each.is_first]
-    return Table(
-        "All other diagnostics",
-        ("encoder", *(each.name for each in others)),
-        [
-            (label, *(number(_value(each, known), SIGNIFICANT) for each in others))
-            for label, known in encoders.items()
-        ],
-    )
-
-
-def _probes(scores: Scores) -> dict[str, str]:
-    """R² of each quantity; of many, of those that vary, the mean and the least."""
-    if len(scores) <= _MANY:
-        return {name: r2_text(score.value) for name, score in scores.items()}
-    known = {name: score.value for name, score in scores.items() if score.value is not None}
-    if not known:
-        return {"probes, mean": "-", "worst probe": "-"}
-    worst = min(known, key=known.__getitem__)
+def lacking(evaluation: Evaluation) -> dict[str, list[Lost]]:
+    """What each code lacks that the full observation has, the most needed first."""
+    beyond = {each.name for each in evaluation.encoders[FULL].loses}
     return {
-        "probes, mean": r2_text(sum(known.values()) / len(known)),
-        "worst probe": f"{worst} {r2_text(known[worst])}",
+        label: [each for each in known.loses if each.name not in beyond]
+        for label, known in evaluation.encoders.items()
+        if label != FULL
     }
+
+
+def _everything(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
+    """Every other diagnostic that is registered, and what each of them is."""
+    encoders = evaluation.encoders
+    rows = [
+        (name, *(number(_score(known, name).value, SIGNIFICANT) for known in encoders.values()))
+        for name, scalar in SCALARS.items()
+        if not scalar.is_first
+    ]
+    yield Table("All other diagnostics", ("diagnostic", *encoders), rows)
+    yield facts({name: scalar.words for name, scalar in SCALARS.items()}, width, 0)

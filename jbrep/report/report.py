@@ -1,36 +1,32 @@
-"""A study's report: a page, figures, and summaries for READMEs and for programs."""
+"""A study's report: findings.json, and what is made from it for readers, with figures."""
 
 import base64
-import json
-from collections.abc import Sequence
+import hashlib
+import shlex
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jbrep.encoders.base import OWN
-from jbrep.evaluate.table import SCALARS
+from markupsafe import Markup
+
+from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, inside, make_folder, write_whole
-from jbrep.report import facts
-from jbrep.report.answer import answer
-from jbrep.report.figures import study_plots, write
-from jbrep.report.markdown import markdown
-from jbrep.report.page import page
-from jbrep.report.returns import returns_tables
-from jbrep.report.statistics import association_tables, results_text
+from jbrep.records.storage import exists, make_folder, write_whole
+from jbrep.report import views
+from jbrep.report.figures import Plot, study_plots, write
+from jbrep.report.figures.panels import PAGE as WHOLE
+from jbrep.report.findings import Findings, find
 from jbrep.report.tables import Tables, check_tables, read_tables
-from jbrep.report.words import notes
-from jbrep.stats import Analysis
-from jbrep.stats.analysis import to_plain
-from jbrep.stats.association import Association, Diagnostic, associations
 from jbrep.study.results import has_runs, write_tables
 from jbrep.study.tables import Return, add_diagnostics
 from jbrep.text import html, terminal_width
 
-PAGE, SUMMARY, MARKDOWN, FIGURES = "report.html", "summary.json", "summary.md", "figures"
-STATISTICS = "statistics.json"
-_MAIN_FIGURE = "final_return"
+FINDINGS, PAGE, MARKDOWN, FIGURES = "findings.json", "report.html", "summary.md", "figures"
+_MAIN_FIGURE = "final_return.png"
 _MOST_SECONDS = 600.0  # to wait for another process's report
+_WIDEST = 1000  # of a figure on the page [CSS pixels]
+_PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size on paper
 
 
 class Report(NamedTuple):
@@ -38,13 +34,15 @@ class Report(NamedTuple):
 
     Attributes:
         folder: that has the page, the tables and the figures.
-        tables: what these say.
-        notes: what the diagnostics that were given are missing, and what couldn't be played.
-        paths: of the page, the summaries and the folder of the figures.
+        tables: what it is made from.
+        findings: what these say.
+        notes: what the diagnostics that were given are missing.
+        paths: of the findings, the page, the summary and the folder of the figures.
     """
 
     folder: Path
     tables: Tables
+    findings: Findings
     notes: list[str]
     paths: list[Path]
 
@@ -59,23 +57,21 @@ class Report(NamedTuple):
         return self.tables.returns
 
     def __repr__(self) -> str:
-        return f"{results_text(self.tables, terminal_width())}\n\n{self.page}"
+        return f"{results_text(self.findings, terminal_width())}\n\n{self.page}"
 
     def _repr_html_(self) -> str:
-        picture = self.folder / FIGURES / f"{_MAIN_FIGURE}.png"
-        if not (self.tables.analysis and exists(picture)):
+        picture = self.folder / FIGURES / _MAIN_FIGURE
+        if not (self.findings.groups and exists(picture)):
             return html(repr(self))
-        content = base64.b64encode(picture.read_bytes()).decode()
-        shown = f'<img width="700" src="data:image/png;base64,{content}">'
-        told = html(*answer(self.tables))
-        return told + shown + html(*returns_tables(self.tables), str(self.page))
+        shown = f'<img width="700" src="data:image/png;base64,{_base64(picture.read_bytes())}">'
+        found = *views.returns_tables(self.findings), *views.verdict_tables(self.findings)
+        return html(*found) + shown + html(str(self.page))
 
 
 def make_report(
     folder: Path,
     out: Path | None = None,
     evaluations: Sequence[str] = (),
-    across_trainers: bool = False,
 ) -> Report:
     """Write the tables of the runs below a folder, if there are any, and the report of the tables.
 
@@ -85,12 +81,11 @@ def make_report(
         folder: with runs, of a study or not, or with the tables of a study alone.
         out: folder for the report; the same one if not given.
         evaluations: as for `jbrep.study.tables.add_diagnostics`.
-        across_trainers: compare runs of different trainers, too.
     """
     out, ran = out or folder, has_runs(folder)
     if not ran:
         check_tables(folder)
-    make_folder(out, () if out.resolve() == folder.resolve() else (SUMMARY,))
+    make_folder(out, () if out.resolve() == folder.resolve() else (FINDINGS,))
     written = [folder, out] if ran or evaluations else [out]
     with ExitStack() as stack:
         for each in sorted({each.resolve() for each in written}):
@@ -98,99 +93,101 @@ def make_report(
         if ran:
             write_tables(folder)
         notes = add_diagnostics(folder, evaluations)
-        tables = read_tables(folder, across_trainers)
-        notes += _without_references(tables)
-        return Report(out, tables, notes, write_report(tables, out))
+        tables = read_tables(folder)
+        found = find(tables)
+        return Report(out, tables, found, notes, write_report(found, out))
 
 
-def _without_references(tables: Tables) -> list[str]:
-    """A line where nothing is known of policies that don't look, so that little can be said."""
-    if unknown := sorted({*tables.record.tasks} - {*tables.references}):
-        return [
-            f"no policy could be played on {', '.join(unknown)}, to compare agents with: if a "
-            "module of yours makes it, add --import MODULE"
-        ]
-    return []
-
-
-def write_report(tables: Tables, out: Path) -> list[Path]:
-    """Write the report of a study's tables.
-
-    Args:
-        tables: of the study, as `jbrep.report.tables.read_tables` gives them.
-        out: a folder for it.
+def write_report(found: Findings, out: Path) -> list[Path]:
+    """Write what was found into a folder: as data, page and summary, with figures.
 
     Returns:
-        The paths of the page, the summaries and the folder of the figures.
+        The paths of these files and of the folder of the figures.
     """
     make_folder(out)
-    associated = _associated(tables)
-    plots = study_plots(
-        tables.analysis, tables.returns, tables.references, tables.record.labels, associated
-    )
-    predictions = association_tables(associated)
-    texts = {
-        PAGE: page(tables, plots, predictions),
-        SUMMARY: _json(_summary(tables), indent=1),
-        MARKDOWN: markdown(tables, predictions, f"{FIGURES}/{_MAIN_FIGURE}.png"),
-    }
-    write(plots, inside(out, FIGURES))
-    if tables.analysis:
-        texts[STATISTICS] = _json(statistics(tables.analysis), indent=2)
-    else:
-        (out / STATISTICS).unlink(missing_ok=True)  # of fewer runs
+    plots = study_plots(found)
+    write(plots, out / FIGURES)
+    texts = {FINDINGS: found.text(), PAGE: page(found, plots), MARKDOWN: summary(found)}
     for name, text in texts.items():
         write_whole(out / name, text.encode())
     return [out / name for name in (*texts, FIGURES)]
 
 
-def _json(contents: dict[str, Any], indent: int) -> str:
-    return json.dumps(contents, indent=indent, allow_nan=False) + "\n"
+def page(found: Findings, plots: Sequence[Plot]) -> str:
+    """One self-contained HTML page; what tables say is shown as text and never runs."""
+    script, style = (Path(__file__).with_name(f"page.{kind}").read_text() for kind in ("js", "css"))
+    return views.render(
+        "page.html.j2",
+        found=found,
+        returns=views.returns_tables(found),
+        verdicts=views.verdict_tables(found),
+        tables=[*views.statistics_tables(found), *views.diagnostic_tables(found)],
+        runs=views.run_tables(found),
+        settings=views.settings_tables(found),
+        commands=commands(found),
+        figures=[_figure(plot) for plot in Progress(plots, unit="figure", delay=1, leave=False)],
+        style=Markup(style),
+        script=Markup(script),
+        script_hash=_base64(hashlib.sha256(script.encode()).digest()),
+    )
 
 
-def _associated(tables: Tables) -> list[Association]:
-    """Each headline diagnostic with the final returns; none without diagnostics or statistics."""
-    if tables.analysis is None:
-        return []
-    known = [Diagnostic(name, each.words, each.better) for name, each in SCALARS.items()]
-    families = {}
-    for label in tables.record.labels.values():
-        task, name = label.settings.task, label.settings.representation
-        kind = label.encoder.kind
-        families[task, name] = name if kind == OWN else kind
-    analysis = tables.analysis
-    return associations(analysis.groups, tables.diagnostics, known, families, analysis.seed)
-
-
-def statistics(analysis: Analysis) -> dict[str, Any]:
-    """All statistics for programs; an interval is [value, low, high], None if not finite."""
+def _figure(plot: Plot) -> Mapping[str, Any]:
+    width = float(plot.figure.get_figwidth())
     return {
-        "format": "jbrep statistics",
-        "format_version": 5,
-        "baseline": analysis.baseline,
-        "seed": analysis.seed,
-        "notes": notes(analysis.planned),
-        "groups": to_plain(analysis.groups),
-        "aggregates": to_plain(analysis.aggregates),
+        "plot": plot,
+        "width": round(min(_WIDEST, _WIDEST * max(width / WHOLE, 0.62))),
+        "narrowest": round(_PER_INCH * width),
+        "picture": _base64(plot.picture("svg")),
+        "table": _base64(plot.csv.encode()),
     }
 
 
-def _summary(tables: Tables) -> dict[str, Any]:
-    """The summary for programs."""
-    record = tables.record
-    return {
-        "format": "jbrep summary",
-        "format_version": 4,
-        "study": tables.name,
-        "runs": len(record.runs),
-        "missing": list(record.missing),
-        "failed": [row[:2] for row in facts.failed_runs(tables).rows],
-        "left_out": tables.left_out,
-        "verdicts": to_plain(tables.analysis.verdicts) if tables.analysis else [],
-        "numbers": {
-            f"{group.task}/{group.algorithm}/{label.representation}": to_plain(label.numbers)
-            for group in (tables.analysis.groups if tables.analysis else ())
-            for label in group.labels
-        },
-        "versions": record.versions,
-    }
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()
+
+
+def commands(found: Findings) -> Mapping[str, str]:
+    """What makes a study again, by what it does."""
+    versions = {name: each.partition("+")[0] for name, each in found.versions[0].items()}
+    packages = shlex.join(f"{name}=={each}" for name, each in versions.items() if name != "jbrep")
+    folder = shlex.quote(found.name)
+    imports = "".join(f" --import {shlex.quote(module)}" for module in found.imports)
+    checkout = (
+        f"In a checkout of jbrep {versions['jbrep']}, with these versions (equal results also need "
+        "the same kind of processor):"
+    )
+    told = {checkout: f"pip install '.[learn]' {packages}"}
+    if found.study:
+        told["This file, as study.toml:"] = found.study
+        told["All runs:"] = f"jbrep study study.toml --out {folder}{imports}"
+    return {**told, "This report, from the runs:": f"jbrep report {folder}"}
+
+
+def summary(found: Findings) -> str:
+    """The summary for a README."""
+    others = (views.comparison_tables, views.aggregate_tables, views.diagnostic_tables)
+    text = views.render(
+        "summary.md.j2",
+        found=found,
+        returns=views.returns_tables(found),
+        verdicts=views.verdict_tables(found),
+        others=[table for tables in others for table in tables(found)],
+        picture=f"{FIGURES}/{_MAIN_FIGURE}",
+    )
+    return text.rstrip("\n") + "\n"
+
+
+def results_text(found: Findings, width: int | None = None, everything: bool = False) -> str:
+    """The tables that answer, and what has to be known of them; all tables if wanted."""
+    more = [*views.statistics_tables(found), *views.diagnostic_tables(found)] if everything else []
+    text = views.render(
+        "terminal.txt.j2",
+        found=found,
+        returns=views.returns_tables(found, brief=True),
+        verdicts=views.verdict_tables(found, brief=True),
+        runs=views.last_returns(found),
+        more=more,
+        width=width,
+    )
+    return text.strip("\n")

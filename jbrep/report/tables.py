@@ -36,11 +36,6 @@ class Tables(NamedTuple):
     analysis: Analysis | None  # None where runs allow no statistics
     left_out: list[str]  # what there are no statistics of, and why
 
-    @property
-    def title(self) -> str:
-        """What the study's file calls it, or else the folder."""
-        return (self.record.study.title if self.record.study else "") or self.name
-
 
 def check_tables(folder: Path) -> None:
     """Make sure that a folder has the tables of a study."""
@@ -52,12 +47,11 @@ def check_tables(folder: Path) -> None:
         )
 
 
-def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
+def read_tables(folder: Path) -> Tables:
     """The tables in a folder, with statistics if they allow any.
 
     Args:
         folder: of a study, or any that `jbrep.study.results.write_tables` wrote tables into.
-        across_trainers: compare runs of different trainers, too.
     """
     check_tables(folder)
     record = read_document(folder / RECORD, RunsRecord)
@@ -67,6 +61,6 @@ def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     told, known = sha256.get(RUN_INFOS), sha256.get(DIAGNOSTICS)
     infos = read_rows(folder / RUN_INFOS, RunInfo, told) if told else []
     rows = read_diagnostics(folder / DIAGNOSTICS, known) if known else []
-    statistics = found(record, returns, references, across_trainers)
+    statistics = found(record, returns, references)
     name = folder.resolve().name.encode(errors="replace").decode()
     return Tables(name, record, returns, infos, references, by_label(rows), *statistics)

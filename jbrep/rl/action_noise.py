@@ -1,37 +1,43 @@
-"""Noise with a memory as stable-baselines3 takes it."""
+"""Coloured noise as stable-baselines3 takes it."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from colorednoise import powerlaw_psd_gaussian
 from numpy.typing import NDArray
 from stable_baselines3.common.noise import ActionNoise
 
-from jbrep.envs.task import Array
+_SHORTEST = 2  # numbers that have a spectrum
 
 
-class StatefulNoise(ActionNoise):
-    """Noise in one lane, drawn from the generator that stable-baselines3 draws from.
+class ColouredActionNoise(ActionNoise):
+    """Coloured noise of one environment, from the generator that stable-baselines3 draws from.
 
     Args:
-        after: what follows a memory, with numbers of a generator.
+        beta: the power falls with frequency^beta.
+        sigma: the standard deviation over an episode.
         size: numbers in an action.
+        steps: of the longest episode.
 
     Attributes:
-        memory: the noise of now, and what is drawn for later, (m, size).
+        ahead: what is drawn for the steps to come, (m, size).
     """
 
-    def __init__(self, after: Callable[[Array, np.random.RandomState], Array], size: int):
+    def __init__(self, beta: float, sigma: float, size: int, steps: int):
         super().__init__()
-        self._after, self._size = after, size
-        self.memory: Array
+        self._beta, self._sigma, self._shape = beta, sigma, (size, max(steps, _SHORTEST))
+        self.ahead: NDArray[np.float64]
         self.reset()
 
     def __call__(self) -> NDArray[Any]:
         """The noise of the next step, (size,)."""
-        self.memory = self._after(self.memory, np.random.mtrand._rand)
-        return self.memory[0].astype(np.float32)
+        if not len(self.ahead):
+            generator = np.random.mtrand._rand
+            unit = powerlaw_psd_gaussian(self._beta, self._shape, random_state=generator)
+            self.ahead = np.ascontiguousarray(self._sigma * unit.T)
+        now, self.ahead = self.ahead[0], self.ahead[1:]
+        return now.astype(np.float32)
 
     def reset(self) -> None:
         """Start another episode."""
-        self.memory = np.zeros((1, self._size))
+        self.ahead = np.zeros((0, self._shape[0]))

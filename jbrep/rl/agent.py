@@ -80,6 +80,11 @@ class Spaces(gymnasium.Env[Any, Any]):
         self.observation_space, self.action_space = observation_space, action_space
 
 
+def acting(policy: BasePolicy) -> BasePolicy:
+    """The part of a policy that chooses actions: without critics where they are apart."""
+    return getattr(policy, "actor", policy)
+
+
 def training_seed(seed: int) -> int:
     """The environment's seed in the run with this seed: its first lane's; the others count on."""
     return int(np.random.SeedSequence(seed).generate_state(1)[0]) >> 1
@@ -91,8 +96,9 @@ def make_agent(
     env: VecEnv | Spaces,
     seed: int,
     episode_steps: int = 1000,
+    device: str = "cpu",
 ) -> BaseAlgorithm:
-    """An untrained agent on the CPU, with its optimisers' state allocated.
+    """An untrained agent, with its optimisers' state allocated.
 
     Its `action_repeat` is for whoever plays its policy, and in policy.zip.
 
@@ -102,6 +108,7 @@ def make_agent(
         env: where it acts.
         seed: of weights and of what it draws.
         episode_steps: of the longest episode, for noise that is drawn for an episode at once.
+        device: of its networks: cpu or cuda.
     """
     of_class = {name: _argument(v) for name, v in hyperparameters.algorithm_kwargs.items()}
     of_policy, of_adam = hyperparameters.policy_kwargs, hyperparameters.optimizer_kwargs
@@ -113,7 +120,7 @@ def make_agent(
             "MlpPolicy",
             env,
             seed=seed,
-            device="cpu",
+            device=device,
             policy_kwargs={
                 **of_policy,
                 "net_arch": to_plain(hyperparameters.net_arch),
@@ -212,25 +219,27 @@ def deterministic_actor(
         batches = torch.from_numpy(observation.astype(np.float32)).split(size)
         with single_torch_thread(), torch.no_grad(), unchecked_distributions():
             chosen = [
-                policy._predict(_as_observed(space, preprocess(each.numpy())), True)
+                policy._predict(_as_observed(space, preprocess(each.numpy()), policy.device), True)
                 for each in batches
             ]
-        actions = torch.cat(chosen).numpy()
+        actions = torch.cat(chosen).numpy(force=True)
         own = policy.unscale_action(actions) if policy.squash_output else actions
         return np.clip(task.unscale_action(own).astype(np.float32) if is_scaled else own, low, high)
 
     return act
 
 
-def _as_observed(space: gymnasium.Space[Any], rows: NDArray[np.float32]) -> Any:
+def _as_observed(
+    space: gymnasium.Space[Any], rows: NDArray[np.float32], device: torch.device
+) -> Any:
     """Flat rows (n, d) in the form in which a policy takes the observations of its space."""
     if isinstance(space, spaces.Dict):
         ends = np.cumsum([flatdim(part) for part in space.spaces.values()])[:-1]
         parts = zip(space.spaces.items(), np.split(rows, ends, 1), strict=True)
-        return {name: _as_observed(part, own) for (name, part), own in parts}
+        return {name: _as_observed(part, own, device) for (name, part), own in parts}
     if isinstance(space, spaces.Discrete):
-        return torch.as_tensor(rows.argmax(1))
-    return torch.as_tensor(rows.reshape(len(rows), *(space.shape or ())))
+        return torch.as_tensor(rows.argmax(1), device=device)
+    return torch.as_tensor(rows.reshape(len(rows), *(space.shape or ())), device=device)
 
 
 def is_action_scaled(space: gymnasium.Space[Any]) -> bool:

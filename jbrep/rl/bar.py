@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from jbrep.progress import Progress
-from jbrep.rl.job import Job
+from jbrep.rl.history import History
 from jbrep.text import rounded, sparkline
 
 _LINE = "{desc}: {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"  # on a terminal
@@ -22,7 +22,7 @@ class Bar:
         self._name = name if len(name) <= _NAME else f"{name[: _NAME - 3]}..."
         self._progress: Any = None
 
-    def show(self, job: Job, step: int) -> None:
+    def show(self, history: History, step: int) -> None:
         """Show the steps so far and the mean returns of the evaluations.
 
         The final evaluation can take minutes: all steps are told before it, and after it again.
@@ -39,7 +39,7 @@ class Bar:
             )
         is_final = self._progress.n < self._steps <= step
         self._progress.update(min(step, self._steps) - self._progress.n)
-        shown = "final ones under way" if is_final else self._course(job.history.means)
+        shown = "final ones under way" if is_final else self._course(history.means)
         self._progress.set_postfix(returns=shown, refresh=is_final)
 
     def _course(self, means: Sequence[float]) -> str:

@@ -1,149 +1,64 @@
-"""What a run has recorded so far, and its checkpoint, which runs no code when it is read."""
+"""A run's checkpoint, and from where the run in a folder goes on.
+
+A checkpoint holds everything that decides how training continues, in a file without code.
+"""
 
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from itertools import groupby
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from msgspec import Meta
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.distributions import StateDependentNoiseDistribution
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+    VectorizedActionNoise,
+)
 
+from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import EnvironmentFailedError
-from jbrep.envs.recording import Outcome
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.records import container
-from jbrep.records.container import Tensors
+from jbrep.records.container import Tensors, without
 from jbrep.records.document import Document, document_from
-from jbrep.records.record import Version, shown
+from jbrep.records.record import Version
 from jbrep.records.storage import exists
-from jbrep.records.tables import rounded
-from jbrep.rl.agent import parameters, restore_statistics, statistics_of
-from jbrep.rl.files import CHECKPOINT, RUN, Episode, Evaluation, Info, read_run
+from jbrep.rl.action_noise import ColouredActionNoise
+from jbrep.rl.agent import acting, parameters, restore_statistics, statistics_of
+from jbrep.rl.files import (
+    CHECKPOINT,
+    FAILED,
+    RUN,
+    Episode,
+    Evaluation,
+    Info,
+    RunRecord,
+    read_run,
+)
+from jbrep.rl.history import History
 from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_STEPS
 
-MAX_BYTES = 1 << 40
 PARAMETERS = "parameters."  # begins the names of what gradient steps change
-LANES = "lanes."  # likewise, of what decides how the lanes continue
+_LANES, _BUFFER = "lanes.", "buffer."  # likewise, of environments and of the replay buffer
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")  # of an agent
-_QUICK = 2.0  # seconds of writing that don't matter
+_MEMORIES: dict[type, str] = {  # of noises that depend on what was drawn before
+    OrnsteinUhlenbeckActionNoise: "noise_prev",
+    ColouredActionNoise: "ahead",
+}
+_UNSCALED = "_last_original_obs"  # before it was normalised
+_EXPLORATION = ("exploration_mat", "exploration_matrices")
+_TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _MALFORMED = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-WEIGHTS_NOT_FINITE = "the policy's weights are not finite"  # reasons for a run to fail
-ACTIONS_NOT_FINITE = "the policy's actions are not finite"
 
 
-class DivergedError(ArithmeticError):
-    """A loss or a weight of the policy is NaN or infinite: training can't continue."""
-
-
-@dataclass
-class History:
-    """What a run has recorded so far, over all the processes that worked on it.
-
-    Attributes:
-        episodes: of training.
-        evaluations: of the deterministic policy.
-        infos: what the environment told at the ends of their episodes.
-        first_step: the training step from which this process continues.
-        earlier_seconds: the wall time that earlier processes took.
-        means: returns of the evaluations.
-    """
-
-    episodes: list[Episode] = field(default_factory=list)
-    evaluations: list[Evaluation] = field(default_factory=list)
-    infos: list[Info] = field(default_factory=list)
-    first_step: int = 0
-    earlier_seconds: float = 0.0
-    means: list[float] = field(default_factory=list)
-    _started: float = field(default_factory=time.monotonic)
-
-    def start(self) -> None:
-        """Count the time from now on: others may have been trained since this was made."""
-        self._started = time.monotonic()
-
-    @property
-    def seconds(self) -> float:
-        """The wall time so far."""
-        return round(self.earlier_seconds + time.monotonic() - self._started, 1)
-
-    @property
-    def mean(self) -> float | None:
-        """The mean return of the last evaluation, once there was one."""
-        return self.means[-1] if self.means else None
-
-    def evaluated(self, step: int, outcome: Outcome) -> None:
-        """Record an evaluation after so many steps."""
-        returns = [rounded(each) for each in outcome.returns]
-        self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(returns)]
-        told = enumerate(outcome.numbers)
-        self.infos += [Info(step, i, *each) for i, numbers in told for each in numbers.items()]
-        self.means.append(float(np.mean(returns)))
-
-    def forget_from(self, step: int) -> None:
-        """Forget the evaluations after so many steps, or more."""
-        self.evaluations = [row for row in self.evaluations if row.step < step]
-        self.infos = [row for row in self.infos if row.step < step]
-        self.means = self._means()
-
-    def resume(self, header: "CheckpointHeader") -> None:
-        """Continue from an earlier process's record."""
-        self.episodes, self.evaluations = header.episodes, header.evaluations
-        self.infos = header.infos
-        self.earlier_seconds, self.first_step = header.seconds, header.step
-        self.means = self._means()
-
-    def _means(self) -> list[float]:
-        by_step = groupby(self.evaluations, lambda each: each.step)
-        return [float(np.mean([each.episode_return for each in own])) for _, own in by_step]
-
-
-class StoppedError(Exception):
-    """A run stopped on request after so many steps, its checkpoint written; `train` resumes it."""
-
-    def __init__(self, step: int):
-        super().__init__(f"stopped after {step:,} steps")
-        self.step = step
-
-
-class Snapshot(NamedTuple):
-    """Everything that decides how an agent's training continues."""
-
-    tensors: Tensors
-    counters: dict[str, Any]  # plain JSON
-
-
-def take(agent: BaseAlgorithm) -> Snapshot:
-    """What an agent itself continues from, whatever trains it; tensors share its memory."""
-    tensors = {f"{PARAMETERS}{name}": tensor.numpy() for name, tensor in parameters(agent)}
-    if statistics := statistics_of(agent):
-        tensors |= statistics.tensors
-    counters = {name: getattr(agent, name) for name in _COUNTERS}
-    episodes = [{k: float(v) for k, v in e.items()} for e in agent.ep_info_buffer or ()]
-    return Snapshot(tensors, {**counters, "episodes": episodes})
-
-
-def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
-    """Bring an agent that is set up to learn to where `take` was."""
-    tensors, counters = snapshot
-    with torch.no_grad():
-        for name, tensor in parameters(agent):
-            tensor.copy_(torch.from_numpy(tensors[f"{PARAMETERS}{name}"]))
-    restore_statistics(agent, tensors, "the checkpoint")
-    for name in _COUNTERS:
-        setattr(agent, name, counters[name])
-    agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
-    agent.start_time = time.time_ns()
-    assert agent.ep_info_buffer is not None
-    agent.ep_info_buffer.clear()  # it may go on from a checkpoint of its own
-    agent.ep_info_buffer.extend(counters["episodes"])
-
-
-class CheckpointHeader(Document, frozen=True, kw_only=True):
+class Header(Document, frozen=True, kw_only=True):
     """The header of a checkpoint.
 
     Attributes:
@@ -151,11 +66,11 @@ class CheckpointHeader(Document, frozen=True, kw_only=True):
         versions: by package; these and the settings must be equal for the run to resume.
         step: of training.
         episodes, evaluations, infos, seconds: of the history so far.
-        counters: of the snapshot.
+        counters: of the agent and its random numbers, as plain JSON.
     """
 
     format = "jbrep checkpoint"
-    format_version = 4
+    format_version = 5
 
     settings: RunSettings
     versions: Mapping[Version, Version]
@@ -166,99 +81,291 @@ class CheckpointHeader(Document, frozen=True, kw_only=True):
     seconds: float
     counters: Mapping[str, Any]
 
-    def check(self) -> None:
-        super().check()
-        for name in _COUNTERS:
-            count = self.counters.get(name, 0)
-            if type(count) is not int or count < 0:
-                raise InputError(f"{name} is {shown(count)}: it must be a whole number from 0")
-
-
-def read_checkpoint(path: Path) -> tuple[Tensors, CheckpointHeader]:
-    """A run's checkpoint.
-
-    Raises:
-        DamageError: it isn't what was written.
-    """
-    tensors, header = container.read(path, "checkpoint", MAX_BYTES)
-    return tensors, document_from(header, path, CheckpointHeader)
-
-
-def run_settings(folder: Path) -> RunSettings:
-    """The settings of a run that has ended or is under way.
-
-    Of a checkpoint the header alone is read, as the file can be large.
-
-    Raises:
-        DamageError: a file isn't what was written.
-    """
-    if exists(folder / RUN):
-        return read_run(folder).settings
-    path = folder / CHECKPOINT
-    return document_from(container.peek(path), path, CheckpointHeader).settings
-
-
-class CheckpointFile:
-    """Where a run's snapshots are kept, the last one alone, each with the history of then."""
-
-    def __init__(
-        self, path: Path, settings: RunSettings, versions: Mapping[str, str], history: History
-    ):
-        self.path, self._history = path, history
-        self._settings, self._versions = settings, versions
-        self._saved, self._took = time.monotonic(), 0.0
-
-    def is_due(self, every: float, together: int = 1) -> bool:
-        """Whether to write the next one.
-
-        Args:
-            every: seconds between them; where writing takes more than two seconds, in proportion
-                more.
-            together: files as large as this that are written one after the other.
-        """
-        age = time.monotonic() - self._saved
-        return age >= every * max(1.0, self._took * together / _QUICK)
-
-    def read(self) -> Snapshot | None:
-        """The snapshot, the history brought to where it was; None if there is none."""
-        if not exists(self.path):
-            return None
-        tensors, header = read_checkpoint(self.path)
-        versions, settings = differences(header.versions, self._versions), header.settings
-        if settings.is_extended_by(self._settings) and not settings.schedules:
-            settings = self._settings
-        if others := settings.differing(self._settings) or versions:
-            told = f"{self.path} belongs to another configuration: {others}; choose another folder"
-            has_ended = exists(self.path.with_name(RUN))  # with fewer steps, which need the file
-            raise InputError(told if has_ended else f"{told}, or delete the file to start over")
-        self._history.resume(header)
-        return Snapshot(tensors, dict(header.counters))
-
-    def write(self, snapshot: Snapshot) -> None:
-        """Replace the last one."""
-        header = CheckpointHeader(
-            settings=self._settings,
-            versions=self._versions,
-            step=self._settings.control_steps(snapshot.counters["num_timesteps"]),
-            episodes=self._history.episodes,
-            evaluations=self._history.evaluations,
-            infos=self._history.infos,
-            seconds=self._history.seconds,
-            counters=snapshot.counters,
+    @property
+    def history(self) -> History:
+        """What the run had recorded by then."""
+        return History(
+            self.episodes, self.evaluations, self.infos, self.seconds, first_step=self.step
         )
-        begun = time.monotonic()
-        container.write(self.path, snapshot.tensors, header.as_json())
-        self._saved = time.monotonic()
-        self._took = self._saved - begun
 
-    @contextmanager
-    def resuming(self) -> Iterator[None]:
-        """Name the file where training can't continue from its snapshot."""
+
+class Checkpoint(NamedTuple):
+    """What a run's checkpoint holds."""
+
+    path: Path
+    header: Header
+    tensors: Tensors
+
+    @classmethod
+    def read(cls, folder: Path) -> "Checkpoint":
+        """The one in a run's folder.
+
+        Raises:
+            DamageError: it isn't what was written.
+        """
+        path = folder / CHECKPOINT
+        tensors, header = container.read(path, "checkpoint")
+        return cls(path, document_from(header, path, Header), tensors)
+
+    def restore(self, agent: BaseAlgorithm) -> None:
+        """Bring an agent that is set up to learn to where the checkpoint was taken.
+
+        Raises:
+            DamageError: what it holds doesn't fit the agent.
+        """
         try:
-            yield
+            _restore(agent, self.tensors, self.header.counters)
         except EnvironmentFailedError as error:
             raise InputError(f"{self.path} can't be resumed: {error}") from None
         except InputError:
             raise
         except _MALFORMED:
             raise DamageError(f"{self.path} is damaged: delete it to start over") from None
+
+
+def read_header(folder: Path) -> Header | None:
+    """The header of a run's checkpoint, without the rest, which can be large; None without one.
+
+    Raises:
+        DamageError: it isn't what was written.
+    """
+    path = folder / CHECKPOINT
+    return document_from(container.peek(path), path, Header) if exists(path) else None
+
+
+def run_settings(folder: Path) -> RunSettings:
+    """The settings of a run that has ended or has a checkpoint.
+
+    Raises:
+        DamageError: a file isn't what was written.
+    """
+    header = None if exists(folder / RUN) else read_header(folder)
+    return header.settings if header else read_run(folder).settings
+
+
+class Standing(NamedTuple):
+    """How far a run has come in its folder.
+
+    Attributes:
+        settings: of the run, with evaluations as far apart as before where the run leaves that
+            open.
+        ended: the contents of run.json, if the run has ended; it may have gone on from fewer steps.
+        resumes: whether it goes on from its checkpoint.
+    """
+
+    settings: RunSettings
+    ended: RunRecord | None = None
+    resumes: bool = False
+
+
+def standing(
+    folder: Path, wanted: RunSettings, versions: Mapping[str, str], is_open: bool = False
+) -> Standing:
+    """How far a run has come in a folder, which is new, or this run's.
+
+    A run of fewer steps goes on from its checkpoint; one that was stopped resumes from it. Both
+    need the versions that it began with, an environment that can be reproduced, and, to go on, a
+    run that has not failed and settings that don't depend on the number of steps.
+
+    Args:
+        folder: of the run; it need not exist.
+        wanted: settings of the run.
+        versions: of the packages that decide its numbers.
+        is_open: whether the run leaves open how far apart evaluations are.
+    """
+    record = read_run(folder) if exists(folder / RUN) else None
+    header = None if record and not record.settings.differing(wanted) else read_header(folder)
+    latest = header or record
+    if latest is None:
+        return Standing(wanted)
+    before = record.settings if record else latest.settings
+    if is_open:
+        same = wanted.replace(evaluate_every=before.evaluate_every)
+        if before.is_extended_by(same) or not before.differing(same):
+            wanted = same
+    if record and not record.settings.differing(wanted):
+        return Standing(wanted, ended=record)
+    is_longer = latest.settings.is_extended_by(wanted)
+    if not is_longer and (others := latest.settings.differing(wanted)):
+        raise InputError(f"{folder} holds another run: {others}; choose another folder")
+    if reason := _obstacle(record, latest.settings, wanted, is_longer):
+        raise InputError(f"the run in {folder} can't go on: {reason}; choose another folder")
+    if header is None:
+        raise InputError(
+            f"the run in {folder} can't go on: {CHECKPOINT} is missing; choose another folder, "
+            "perhaps with --from"
+        )
+    if others := differences(header.versions, versions):
+        raise InputError(
+            f"the run in {folder} can't go on with other versions: {others}; install those, or "
+            "choose another folder"
+        )
+    return Standing(wanted, resumes=True)
+
+
+def _obstacle(
+    record: RunRecord | None, before: RunSettings, wanted: RunSettings, is_longer: bool
+) -> str:
+    """Why a run can't go on; empty if it can."""
+    if record and record.status == FAILED:
+        return "it failed"
+    if is_longer and before.schedules:
+        return f"its {before.schedules[0]} fell to 0 over {before.steps:,} steps"
+    if not wanted.environment.reproducible:
+        return (
+            f"{wanted.task} is not reproducible (its policy can be played and exported: see jbrep "
+            "evaluate-policy)"
+        )
+    return ""
+
+
+class Saver:
+    """Writes a run's checkpoints, the last one alone.
+
+    Args:
+        folder: of the run.
+        settings, versions: of the run.
+        every: seconds between checkpoints; more where writing one takes over two seconds.
+    """
+
+    def __init__(
+        self, folder: Path, settings: RunSettings, versions: Mapping[str, str], every: float
+    ):
+        self._path, self._settings, self._versions = folder / CHECKPOINT, settings, versions
+        self._every, self._saved, self._took = every, time.monotonic(), 0.0
+
+    @property
+    def is_due(self) -> bool:
+        """Whether to write the next one."""
+        return time.monotonic() - self._saved >= self._every * max(1.0, self._took / 2)
+
+    def write(self, agent: BaseAlgorithm, history: History) -> None:
+        """Replace the last one."""
+        begun = time.monotonic()
+        tensors, counters = _take(agent)
+        header = Header(
+            settings=self._settings,
+            versions=self._versions,
+            step=self._settings.control_steps(agent.num_timesteps),
+            episodes=history.episodes,
+            evaluations=history.evaluations,
+            infos=history.infos,
+            seconds=history.seconds,
+            counters=counters,
+        )
+        container.write(self._path, tensors, header.as_json())
+        self._saved = time.monotonic()
+        self._took = self._saved - begun
+
+
+def _take(agent: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
+    """What an agent between two rollouts continues from; tensors share its memory."""
+    tensors = {f"{PARAMETERS}{name}": t.numpy(force=True) for name, t in parameters(agent)}
+    if statistics := statistics_of(agent):
+        tensors |= statistics.tensors
+    tensors |= {f"{_LANES}{name}": values for name, values in vec_env(agent).state.items()}
+    tensors |= {name: getattr(*place) for name, place in _arrays(agent).items()}
+    kind, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws there
+    tensors |= {"torch": torch.get_rng_state().numpy(), "numpy": np.asarray(keys)}
+    if agent.device.type == "cuda":
+        tensors["cuda"] = torch.cuda.get_rng_state().numpy()
+    if noise := _state_dependent_noise(agent):
+        tensors |= {name: getattr(noise, name).numpy(force=True) for name in _EXPLORATION}
+    counters: dict[str, Any] = {name: getattr(agent, name) for name in _COUNTERS}
+    counters |= {
+        "numpy": (kind, position, has_gauss, gauss),
+        "action_space": agent.action_space.np_random.bit_generator.state,
+        "episodes": [{k: float(v) for k, v in e.items()} for e in agent.ep_info_buffer or ()],
+    }
+    if buffer := _buffer(agent):
+        counters["buffer"] = (buffer.pos, buffer.full)
+        tensors |= {f"{_BUFFER}{name}": values for name, values in _filled(buffer).items()}
+    return tensors, counters
+
+
+def _restore(agent: BaseAlgorithm, tensors: Tensors, counters: Mapping[str, Any]) -> None:
+    with torch.no_grad():
+        for name, tensor in parameters(agent):
+            tensor.copy_(torch.from_numpy(tensors[f"{PARAMETERS}{name}"]))
+    restore_statistics(agent, tensors, "the checkpoint")
+    for name in _COUNTERS:
+        setattr(agent, name, int(counters[name]))
+    agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
+    agent.start_time = time.time_ns()
+    assert agent.ep_info_buffer is not None
+    agent.ep_info_buffer.clear()
+    agent.ep_info_buffer.extend(counters["episodes"])
+    if buffer := _buffer(agent):
+        buffer.pos, buffer.full = counters["buffer"]
+        for name, values in _filled(buffer).items():
+            values[:] = tensors[f"{_BUFFER}{name}"]
+    for name, place in _arrays(agent).items():
+        setattr(*place, tensors[name])
+    vec_env(agent).restore(without(_LANES, tensors))
+    agent.action_space.np_random.bit_generator.state = counters["action_space"]
+    restore_draws(agent, tensors)
+    kind, *rest = counters["numpy"]
+    np.random.set_state((kind, tensors["numpy"], *rest))  # noqa: NPY002
+
+
+def restore_draws(agent: BaseAlgorithm, tensors: Tensors) -> None:
+    """Bring torch's generator, and what was drawn from it last, to where they were."""
+    torch.set_rng_state(torch.from_numpy(tensors["torch"]))
+    if agent.device.type == "cuda":
+        torch.cuda.set_rng_state(torch.from_numpy(tensors["cuda"]))
+    if noise := _state_dependent_noise(agent):
+        for name in _EXPLORATION:
+            setattr(noise, name, torch.from_numpy(tensors[name]).to(agent.device))
+
+
+def draw_noise(agent: BaseAlgorithm) -> None:
+    """Draw state-dependent noise, if there is any, as the next rollout would at its start."""
+    if _state_dependent_noise(agent):
+        policy: Any = acting(agent.policy)
+        policy.reset_noise(agent.n_envs)
+
+
+def _arrays(agent: BaseAlgorithm) -> dict[str, tuple[object, str]]:
+    """Which arrays decide how a rollout goes on: the object that has each, and its attribute."""
+    normalizer = agent.get_vec_normalize_env()
+    monitor = normalizer.venv if normalizer else agent.env
+    last = ("_last_obs", "_last_episode_starts")
+    places: dict[str, tuple[object, str]] = {f"rollout.{name}": (agent, name) for name in last}
+    if normalizer:
+        places[_UNSCALED] = agent, _UNSCALED
+    for i, noise in enumerate(_noises(agent)):
+        if memory := _MEMORIES.get(type(noise)):
+            places[f"noise.{i}"] = noise, memory
+    return places | {
+        "returns": (monitor, "episode_returns"),
+        "lengths": (monitor, "episode_lengths"),
+    }
+
+
+def _state_dependent_noise(agent: BaseAlgorithm) -> StateDependentNoiseDistribution | None:
+    """The distribution that explores by noise on features, with use_sde."""
+    distribution = getattr(acting(agent.policy), "action_dist", None)
+    return distribution if isinstance(distribution, StateDependentNoiseDistribution) else None
+
+
+def vec_env(agent: BaseAlgorithm) -> JitterbugVecEnv:
+    """The environments that an agent is trained in."""
+    env = agent.env.unwrapped if agent.env else None
+    assert isinstance(env, JitterbugVecEnv)
+    return env
+
+
+def _buffer(agent: BaseAlgorithm) -> ReplayBuffer | None:
+    return getattr(agent, "replay_buffer", None)
+
+
+def _filled(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
+    """Views of the filled part of the buffer."""
+    size = buffer.buffer_size if buffer.full else buffer.pos
+    return {name: getattr(buffer, name)[:size] for name in _TRANSITIONS}
+
+
+def _noises(agent: BaseAlgorithm) -> Sequence[ActionNoise]:
+    """The action noise of each environment, if there is any."""
+    noise = getattr(agent, "action_noise", None)
+    return noise.noises if isinstance(noise, VectorizedActionNoise) else [noise] if noise else []

@@ -1,6 +1,5 @@
 """Trained policies as functions of what a robot's sensors say, in NumPy alone."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,12 +10,11 @@ from jbrep.coordinates import library_of
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.file import load
-from jbrep.encoders.fold import Chain
-from jbrep.encoders.layers import ACTIVATIONS, Layer, activate, run
+from jbrep.encoders.layers import ACTIVATIONS, Layer, activate, dense, run
 from jbrep.envs.recording import held
 from jbrep.envs.view import Window
 from jbrep.errors import DamageError, InputError, choose, first_line, listed
-from jbrep.records.container import Tensors
+from jbrep.records.container import Tensors, without
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, POLICY, POLICY_ZIP, RUN, is_run, read_finished
 from jbrep.rl.normalization import CLIP, Statistics
@@ -210,40 +208,38 @@ def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[La
         raise InputError("a policy with use_sde isn't a chain of layers: it can't be taken out")
     activation = str(shape.policy_kwargs.get("activation_fn")).replace("_", "-")
     choose(activation, ACTIVATIONS, "activation")
-    chain = Chain(inputs)
-    for prefix in _HIDDEN:
-        parts = _numbered(prefix, weights)
-        for number, tensors in sorted(parts.items()):
-            chain = _added(chain, tensors)
-            last = prefix == "mu." and number == max(parts)
-            if "weight" in tensors and not last:
-                chain = chain.activate(activation)
-    for name in _LAST:
-        if f"{name}.weight" in weights:
-            chain = chain.affine(weights[f"{name}.weight"], weights[f"{name}.bias"])
-    if chain.width != settings.environment.action_size:
+    parts = [part for prefix in _HIDDEN for part in _numbered(prefix, weights)]
+    parts += [
+        {"weight": weights[f"{name}.weight"], "bias": weights[f"{name}.bias"]}
+        for name in _LAST
+        if f"{name}.weight" in weights
+    ]
+    layers: list[Layer] = []
+    factor, shift = np.ones(inputs), np.zeros(inputs)  # applied to what the next layer takes
+    for tensors in parts:
+        if "weight" in tensors:
+            weight = tensors["weight"].astype(np.float64)
+            layers.append(dense(weight * factor, weight @ shift + tensors["bias"], activation))
+            factor, shift = np.ones(len(weight)), np.zeros(len(weight))
+        else:  # CrossQ's batch renormalisation
+            deviation = np.sqrt(tensors["ra_var"].astype(np.float64) + _RENORM_EPSILON)
+            factor = tensors["scale"] / deviation
+            shift = tensors["bias"] - tensors["ra_mean"] * factor
+    if layers[-1].units != settings.environment.action_size:
         raise InputError(
-            f"the policy doesn't fit the run's settings: it gives {chain.width} actions"
+            f"the policy doesn't fit the run's settings: it gives {layers[-1].units} actions"
         )
-    return chain.layers()
+    return (*layers[:-1], layers[-1]._replace(activation="linear"))
 
 
-def _numbered(prefix: str, weights: Tensors) -> dict[int, dict[str, NDArray[Any]]]:
-    """The tensors of the layers of a sequence, by their places in it."""
-    parts: dict[int, dict[str, NDArray[Any]]] = {}
-    for name, values in weights.items():
-        number, _, what = name.removeprefix(prefix).partition(".")
-        if name.startswith(prefix) and number.isdecimal():
+def _numbered(prefix: str, weights: Tensors) -> list[Tensors]:
+    """The tensors of each layer of a sequence that has some, in order."""
+    parts: dict[int, Tensors] = {}
+    for name, values in without(prefix, weights).items():
+        number, _, what = name.partition(".")
+        if number.isdecimal():
             parts.setdefault(int(number), {})[what] = values
-    return parts
-
-
-def _added(chain: Chain, tensors: Mapping[str, NDArray[Any]]) -> Chain:
-    """The chain with a dense layer's affine map, or with CrossQ's batch renormalisation."""
-    if "weight" in tensors:
-        return chain.affine(tensors["weight"], tensors["bias"])
-    factor = tensors["scale"] / np.sqrt(tensors["ra_var"].astype(np.float64) + _RENORM_EPSILON)
-    return chain.scale(factor, tensors["bias"] - tensors["ra_mean"] * factor)
+    return [part for _, part in sorted(parts.items())]
 
 
 def load_policy(source: str | Path, encoder: Any = None) -> Controller:
@@ -264,8 +260,8 @@ def load_policy(source: str | Path, encoder: Any = None) -> Controller:
     if exists(path / RUN) and exists(path / ENCODER) and encoder is None:
         _, sha256 = read_finished(path)
         return _of_file(read(path / POLICY, sha256), load(path / ENCODER))
+    from jbrep.rl.agent import acting
     from jbrep.rl.policy import load_run  # imports torch
-    from jbrep.rl.trained import acting
 
     trained = load_run(path, encoder)
     assert trained.settings is not None

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.encoders.encoder import Encoder
+from jbrep.encoders.layers import ONNX
 from jbrep.errors import InputError, choose
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists, taken, write_new
@@ -86,6 +87,12 @@ def _torch(controller: Controller) -> bytes:
     import torch
 
     encoder, acting = controller.encoder, controller.acting.in_torch()
+    assert isinstance(encoder, Encoder)
+    if any(layer.activation == ONNX for layer in encoder.encoder):
+        raise InputError(
+            f"the encoder {encoder.name} is an ONNX model, which torch can't hold: choose the "
+            "format onnx"
+        )
 
     class Policy(torch.nn.Module):
         def forward(self, observation: torch.Tensor) -> torch.Tensor:

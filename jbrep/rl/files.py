@@ -55,8 +55,7 @@ class RunRecord(Document, frozen=True, kw_only=True):
     """run.json: a run that has ended."""
 
     format = "jbrep run"
-    format_version = 5
-    max_bytes = 1 << 22
+    format_version = 7
 
     status: Literal["finished", "failed"]
     reason: Line | None  # why it failed
@@ -89,7 +88,7 @@ class PolicyHeader(Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep policy"
-    format_version = 4
+    format_version = 5
 
     settings: RunSettings
     encoder: dict[str, Any] | None
@@ -108,7 +107,7 @@ class ZipHeader(Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep policy.zip"
-    format_version = 1
+    format_version = 2
 
     environment: Task
     encoder: Sha256

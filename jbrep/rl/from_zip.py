@@ -23,7 +23,6 @@ from jbrep.errors import InputError, refusing
 from jbrep.records.storage import read_file
 from jbrep.rl.agent import action_repeat, is_action_scaled, one_line
 from jbrep.rl.normalization import Statistics
-from jbrep.rl.policy_file import MAX_BYTES
 from jbrep.rl.policy_zip import ZipMetadata, read_metadata
 from jbrep.rl.presets import sb3_class
 from jbrep.rl.trained import Trained
@@ -66,7 +65,7 @@ def load_zip(
             f"{path} is not in a folder of jbrep rl: stable-baselines3 files hold pickled Python, "
             "which runs as code when it is read; add --trust if you know who made it"
         )
-    raw = read_file(path.resolve(), MAX_BYTES)
+    raw = read_file(path)
     agent, told = _loaded(raw, path, algorithm)
     if told:
         return Zipped(_as_told(agent, told, path, task, encoder, vecnormalize), "")
@@ -173,7 +172,7 @@ def _shown(bounds: NDArray[np.float32]) -> str:
 def _statistics(path: Path, space: spaces.Space[Any]) -> Statistics | None:
     """What a VecNormalize normalises observations by, flat; None if it leaves them as they are."""
     with refusing(f"{path} isn't what VecNormalize.save wrote for this policy", told=one_line):
-        normalizer = pickle.loads(read_file(path.resolve(), MAX_BYTES))
+        normalizer = pickle.loads(read_file(path))
         if not isinstance(normalizer, VecNormalize):
             raise TypeError(f"it holds a {type(normalizer).__name__}")
         return _read(normalizer, space) if normalizer.norm_obs else None

@@ -14,7 +14,7 @@ from jbrep.errors import DamageError, InputError
 from jbrep.records.storage import exists, read_file
 from jbrep.rl.files import ENCODER, PolicyHeader, is_policy_file
 from jbrep.rl.policy import load_run
-from jbrep.rl.policy_file import MAX_BYTES, unpack
+from jbrep.rl.policy_file import unpack
 from jbrep.rl.trained import Trained, of_file, pack
 from jbrep.text import printable
 
@@ -68,7 +68,7 @@ def freeze(source: str, path: Path, file: str) -> Frozen:
         DamageError: a file isn't what was written.
     """
     if is_policy_file(path):
-        return Frozen(file, read_file(path, MAX_BYTES))
+        return Frozen(file, read_file(path))
     if not exists(path / ENCODER):
         raise InputError(
             f"{source} can't be collected with: its encoder is code, which can't be kept with the "
@@ -81,7 +81,7 @@ def kept(source: str, path: Path) -> Frozen | None:
     """The policy that a data set has already in a file, if it is that of the source."""
     if not exists(path):
         return None
-    found = Frozen(path.name, read_file(path, MAX_BYTES))
+    found = Frozen(path.name, read_file(path))
     return found if found.settings()["run"] == _line(source) else None
 
 
@@ -97,7 +97,7 @@ def read_frozen(folder: Path, settings: Mapping[str, Any]) -> Frozen:
         DamageError: it isn't the one that the data were collected with.
     """
     path = folder / settings["file"]
-    frozen = Frozen(settings["file"], read_file(path, MAX_BYTES))
+    frozen = Frozen(settings["file"], read_file(path))
     if frozen.settings() != settings:
         raise DamageError(f"{path} is damaged or another policy: its SHA-256 isn't in the manifest")
     return frozen

@@ -18,7 +18,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from jbrep.errors import InputError, refusing
 from jbrep.records.record import converted, shown, to_plain
 from jbrep.rl.agent import ACTIVATIONS, Spaces, global_random_state_kept, make_agent, one_line
-from jbrep.rl.policy_file import MAX_BYTES
 from jbrep.rl.presets import (
     Hyperparameters,
     NetArch,
@@ -29,7 +28,7 @@ from jbrep.rl.presets import (
 )
 
 _MOST = 10**9  # of any number
-_MOST_BYTES = MAX_BYTES // 2  # of networks; the rest is for observations and an encoder
+_MOST_BYTES = 1 << 27  # of networks; the rest is for observations and an encoder
 _ANY_SPACES = (spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-1, 1, (1,), np.float32))
 _RANGES: dict[str, tuple[float, float]] = {  # others: from 1 if whole, else from 0
     **dict.fromkeys(("gamma", "tau", "gae_lambda", "batch_norm_momentum"), (0, 1)),
@@ -41,14 +40,10 @@ _RANGES: dict[str, tuple[float, float]] = {  # others: from 1 if whole, else fro
     "n_critics": (1, 10),
     "n_quantiles": (1, 200),
 }
-_SCHEDULE = Annotated[
-    str,
-    Meta(pattern=r"\Alinear:([0-9]+\.?[0-9]*|\.[0-9]+)(e-?[0-9]{1,2})?\Z", title="linear:NUMBER"),
-]
-_NONE = Annotated[None, Meta(title="none")]
+_SCHEDULE = Annotated[str, Meta(pattern=r"\Alinear:([0-9]+\.?[0-9]*|\.[0-9]+)(e-?[0-9]{1,2})?\Z")]
 _FREQUENCY = Annotated[  # of two parts, but msgspec 0.22 crashes on that beside a bounded number
     tuple[Annotated[int, Meta(ge=1)] | Literal["step", "episode"], ...],
-    Meta(min_length=2, max_length=2, title='[1, "episode"]'),
+    Meta(min_length=2, max_length=2),
 ]
 _OWN = {*Hyperparameters.__struct_fields__} - {"algorithm_kwargs", "policy_kwargs"}
 _REFUSED = {  # arguments that are jbrep's own, with the reason
@@ -216,7 +211,7 @@ def _allowed(name: str, annotation: Any) -> Any:
     kinds = typing.get_args(annotation) if is_union else (annotation,)
     least, most = _RANGES.get(name, (1 if int in kinds else 0, _MOST))
     bounds = Meta(ge=least, le=most)
-    as_json = {int: Annotated[int, bounds], float: Annotated[float, bounds], types.NoneType: _NONE}
+    as_json = {int: Annotated[int, bounds], float: Annotated[float, bounds], types.NoneType: None}
     options = [_FREQUENCY if typing.get_origin(k) is tuple else as_json.get(k, k) for k in kinds]
     options = [_SCHEDULE if Callable in (k, typing.get_origin(k)) else k for k in options]
     return typing.Union[tuple(options)]  # noqa: UP007 - of a list

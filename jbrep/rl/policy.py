@@ -5,13 +5,12 @@ from typing import Any
 
 from jbrep.encoders import find, load
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.code import make
-from jbrep.encoders.encoder import as_file
+from jbrep.encoders.shipped import make
 from jbrep.errors import InputError, differences
 from jbrep.records.container import without
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
-from jbrep.rl.checkpoint import PARAMETERS, read_checkpoint, run_settings
+from jbrep.rl.checkpoint import PARAMETERS, Checkpoint, run_settings
 from jbrep.rl.files import (
     BEGINNING,
     CHECKPOINT,
@@ -52,8 +51,7 @@ def load_run(folder: Path, encoder: Any = None) -> Trained:
         policy = read(folder / POLICY, sha256)
         built = _untrained(folder, run.settings, encoder)
         return built.with_weights(policy.weights, policy.tensors, policy.path)
-    path = folder / CHECKPOINT
-    tensors, header = read_checkpoint(path)
+    path, header, tensors = Checkpoint.read(folder)
     built = _untrained(folder, header.settings, encoder)._replace(step=header.step)
     part = f"{PARAMETERS}policy.{acting_prefix(built.policy)}"
     weights = {
@@ -84,7 +82,7 @@ def _untrained(folder: Path, settings: RunSettings, given: Any) -> Trained:
         if given is None:
             encoder = run_encoder(folder, settings)
         else:
-            encoder = as_file(find(given, settings.environment))
+            encoder = find(given, settings.environment)
     return build(settings, encoder, folder)
 
 

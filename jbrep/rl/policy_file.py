@@ -17,7 +17,6 @@ from jbrep.records.document import document_from
 from jbrep.records.storage import read_file
 from jbrep.rl.files import PolicyHeader
 
-MAX_BYTES = 1 << 28
 ACTING, TRAINING, ENCODER = "policy.", "training.", "encoder."  # before the names of tensors
 
 
@@ -54,7 +53,7 @@ def read(path: Path, sha256: str = "") -> PolicyFile:
     Raises:
         DamageError: it isn't what was written, or the file with that hash.
     """
-    raw = read_file(path, MAX_BYTES)
+    raw = read_file(path)
     if sha256 and hashlib.sha256(raw).hexdigest() != sha256:
         raise DamageError(f"{path} is damaged or another run's: its SHA-256 isn't in run.json")
     return unpack(raw, path)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import data_to_json
 
-from jbrep.records.document import document_in
+from jbrep.records.document import document_from, parse_json
 from jbrep.rl.agent import statistics_of
 from jbrep.rl.files import ZipHeader
 from jbrep.rl.run_settings import RunSettings
@@ -84,7 +84,9 @@ def read_metadata(raw: bytes, path: Path) -> ZipMetadata | None:
     names = members.namelist()
     if _HEADER not in names:
         return None
-    header = document_in(members.read(_HEADER), path, ZipHeader)
+    header = document_from(
+        parse_json(members.read(_HEADER), path, ZipHeader.format), path, ZipHeader
+    )
     has_statistics = STATISTICS in names
     statistics = safetensors.numpy.load(members.read(STATISTICS)) if has_statistics else {}
     return ZipMetadata(header, statistics)

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from jbrep.errors import InputError, choose
 from jbrep.records.record import Finite, Record, from_plain
-from jbrep.rl.noise import EXAMPLES, Noise, NormalNoise, OrnsteinUhlenbeckNoise
+from jbrep.rl.noise import Noise, NormalNoise, OrnsteinUhlenbeckNoise
 from jbrep.rl.settings import CLASSES, MODERN, PAPER, WIDE
 
 if TYPE_CHECKING:
@@ -26,13 +26,7 @@ Layers = Annotated[
     tuple[Annotated[int, Meta(ge=1, le=MAX_UNITS)], ...], Meta(max_length=MAX_LAYERS)
 ]
 _Parts = Annotated[Mapping[str, Layers], Meta(min_length=1, max_length=2)]
-NetArch = Annotated[
-    Layers | _Parts,
-    Meta(
-        title=f"a list of at most {MAX_LAYERS} whole numbers from 1 to {MAX_UNITS:,}, or an object "
-        "of such lists"
-    ),
-]
+NetArch = Layers | _Parts
 
 
 class _OfAdam(Record, frozen=True):
@@ -65,7 +59,7 @@ class Hyperparameters(Record, frozen=True):
     net_arch: NetArch
     algorithm_kwargs: Mapping[str, Any]
     num_envs: Annotated[int, Meta(ge=1, le=MAX_ENVS)] = 1
-    noise: Annotated[Noise | None, Meta(title=EXAMPLES)] = None
+    noise: Noise | None = None
     optimizer_kwargs: Mapping[str, Any] = {}
     policy_kwargs: Mapping[str, Any] = msgspec.field(
         default_factory=lambda: {"activation_fn": "relu"}

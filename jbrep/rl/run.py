@@ -8,29 +8,15 @@ from msgspec import UNSET
 
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import as_file
 from jbrep.envs.description import as_task
 from jbrep.envs.names import is_code
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
 from jbrep.records.record import Sha256, to_plain
-from jbrep.rl.cohort import ALGORITHMS
-from jbrep.rl.cohort.algorithm import check as check_for_cohort
 from jbrep.rl.learner import Learner
 from jbrep.rl.policy import policy_to_begin_with
 from jbrep.rl.presets import usual_preset
 from jbrep.rl.run_settings import RunSettings
-from jbrep.rl.settings import (
-    COHORT,
-    CPU,
-    CUDA,
-    FLOAT32,
-    MAX_EPISODES,
-    SB3,
-    Name,
-    Seed,
-    TrainingSettings,
-)
+from jbrep.rl.settings import MAX_EPISODES, Name, Seed, TrainingSettings
 from jbrep.training.trainer import get_device, single_torch_thread
 
 # where a run doesn't say: evaluations before the last, steps between them, and how many times as
@@ -88,9 +74,9 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
         return cls(task=as_task(task), learner=learner, **others)
 
     def find_encoder(self) -> BaseEncoder:
-        """The encoder; a user's torch module as the file that is kept of it, if it can be."""
+        """The encoder."""
         with single_torch_thread():  # as in training, so that a module computes the same bits
-            return as_file(find(self.encoder, self.task))
+            return find(self.encoder, self.task)
 
     def settings(self, encoder: BaseEncoder) -> RunSettings:
         """All settings that two equal runs share.
@@ -99,10 +85,8 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
             encoder: what `find_encoder` returns.
         """
         is_kept_as_code = is_code(self.encoder) and not isinstance(encoder, Encoder)
-        trainer, shared = trainer_of(self.learner, self), to_plain(self.training_settings)
-        shared |= {
-            "trainer": trainer,
-            "device": str(get_device(self.device).type) if trainer == COHORT else CPU,
+        shared = to_plain(self.training_settings) | {
+            "device": get_device(self.device).type,
             "evaluate_every": self.evaluate_every or max(self.steps // _EVALUATIONS, _APART),
             "final_episodes": self.final_episodes
             or min(_FINAL * self.evaluation_episodes, MAX_EPISODES),
@@ -129,15 +113,3 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
             return settings
         sha256 = policy_to_begin_with(Path(self.begin_from), settings, encoder.latent_size)
         return settings.replace(begin_from=sha256)
-
-
-def trainer_of(learner: Learner, settings: TrainingSettings) -> str:
-    """The trainer of runs of a learner, which can train them."""
-    trainer = settings.trainer or (COHORT if learner.algorithm in ALGORITHMS else SB3)
-    if trainer == COHORT:
-        check_for_cohort(learner.algorithm, learner.hyperparameters)
-    elif settings.precision != FLOAT32:
-        raise InputError(f"{trainer} has no {settings.precision}: leave the precision out")
-    elif settings.device == CUDA:
-        raise InputError(f"{trainer} trains on the cpu here: leave the device out")
-    return trainer

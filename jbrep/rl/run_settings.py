@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from jbrep.envs.task import Id, Task, changed_parts
+from jbrep.envs.task import Id, Task
 from jbrep.errors import InputError, differences
 from jbrep.records.record import Sha256, to_plain
 from jbrep.rl.presets import LINEAR, Hyperparameters, learns_from
@@ -21,10 +21,7 @@ from jbrep.rl.settings import (
     TrainingSettings,
 )
 
-_Algorithm = Annotated[
-    str,
-    Meta(pattern=rf"\A({'|'.join(CLASSES)})\Z", title=f"one of {', '.join(CLASSES)}"),
-]
+_Algorithm = Annotated[str, Meta(pattern=rf"\A({'|'.join(CLASSES)})\Z")]
 
 
 class SharedSettings(TrainingSettings, frozen=True, kw_only=True):
@@ -41,7 +38,6 @@ class SharedSettings(TrainingSettings, frozen=True, kw_only=True):
     encoder_code: Line | None  # module:Class, if it is code that no file can hold
     evaluate_every: Steps
     final_episodes: Episodes
-    trainer: Literal["cohort", "sb3"]
     device: Literal["cpu", "cuda"]
 
     def check(self) -> None:
@@ -119,8 +115,6 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
 
     def differing(self, wanted: "RunSettings") -> str:
         """How they differ from those of the run at hand, for a message; empty if they don't."""
-        if changed := changed_parts(self.environment, wanted.environment):
-            return f"{self.task} as it was before {changed} changed"
         return differences(_flat(self), _flat(wanted))
 
 

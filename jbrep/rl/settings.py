@@ -18,8 +18,6 @@ CLASSES = {  # by the names of algorithms
     "crossq": "sb3_contrib.CrossQ",
 }
 CPU, CUDA = "cpu", "cuda"
-COHORT, SB3 = "cohort", "sb3"
-PRECISIONS = FLOAT32, BFLOAT16 = "float32", "bfloat16"
 PAPER, MODERN, WIDE = "paper", "modern", "wide"  # presets; a name without one has the paper's
 MAX_STEPS = 10**12  # of training
 MAX_EPISODES = 10_000  # of an evaluation
@@ -29,25 +27,12 @@ MAX_LINE = 1000  # letters
 MAX_NAME = 100  # letters of a learner's name
 
 Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
-Name = Annotated[
-    str,
-    Meta(
-        pattern=r"\A[\w.-]{1,100}\Z",
-        title="a name of letters, digits, dots, hyphens and underscores",
-    ),
-]
-LearnerName = Annotated[
-    str,
-    Meta(
-        pattern=rf"\A(?=.*[^.])[\w.+=-]{{1,{MAX_NAME}}}\Z",
-        title=f"at most {MAX_NAME} letters, digits and characters of . _ - + =",
-    ),
-]
+Name = Annotated[str, Meta(pattern=r"\A[\w.-]{1,100}\Z")]
+LearnerName = Annotated[str, Meta(pattern=rf"\A(?=.*[^.])[\w.+=-]{{1,{MAX_NAME}}}\Z")]
 Line = Annotated[  # nothing in it controls a terminal
     str,
     Meta(
-        pattern=rf"\A[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]{{0,{MAX_LINE}}}\Z",
-        title=f"a line of at most {MAX_LINE:,} letters",
+        pattern=rf"\A[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]{{0,{MAX_LINE}}}\Z"
     ),
 ]
 Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]
@@ -85,24 +70,9 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
             extra={"default": "ten times as many"},
         ),
     ] = 0
-    trainer: Annotated[
-        Literal["", "cohort", "sb3"],
-        Meta(
-            title="cohort or sb3",
-            description="cohort, which is jbrep's own, or sb3, stable-baselines3 itself.",
-            extra={"default": "cohort for ddpg, td3 and sac, sb3 for the others"},
-        ),
-    ] = ""
-    precision: Annotated[
-        Literal["float32", "bfloat16"],
-        Meta(
-            description="Of a cohort's matrix multiplications: float32, or bfloat16, which some "
-            "processors compute several times as fast."
-        ),
-    ] = "float32"
     device: Annotated[
         Literal["cpu", "cuda", "auto"],
-        Meta(description="Where a cohort takes gradient steps; auto is cuda where there is one."),
+        Meta(description="Of gradient steps; auto is cuda where there is one."),
     ] = "cpu"
 
     def check(self) -> None:

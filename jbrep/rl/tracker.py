@@ -12,7 +12,6 @@ from stable_baselines3.common.logger import KVWriter
 
 from jbrep.errors import first_line
 from jbrep.records.record import to_plain
-from jbrep.records.storage import inside
 from jbrep.rl.run_settings import RunSettings
 
 TENSORBOARD = "tensorboard"  # what is kept from it is kept from here, too
@@ -63,7 +62,6 @@ class Tracker(KVWriter):
                 self._failed = True
 
     def _begin(self) -> Any:
-        inside(self._folder, "wandb")
         text = json.dumps([self._project, str(self._folder), self._settings], sort_keys=True)
         return wandb.init(
             project=self._project,

@@ -19,6 +19,7 @@ from jbrep.records import container
 from jbrep.records.container import Tensors, without
 from jbrep.rl.agent import (
     Spaces,
+    acting,
     deterministic_actor,
     global_random_state_kept,
     make_agent,
@@ -65,7 +66,7 @@ class Trained(NamedTuple):
         """The same with an encoder in torch, in one episode at a time."""
         encode = self.encoder.encode
         preprocess = preprocessor(
-            lambda row: encode(torch.from_numpy(row)).numpy(), self.statistics
+            lambda row: np.asarray(encode(torch.from_numpy(row))), self.statistics
         )
         return self._held(deterministic_actor(self.policy, self.task, preprocess, batch_size=1))
 
@@ -93,11 +94,6 @@ def _finite(act: Actor) -> Actor:
         return actions
 
     return checked
-
-
-def acting(policy: BasePolicy) -> BasePolicy:
-    """The part of a policy that chooses actions: without critics where they are apart."""
-    return getattr(policy, "actor", policy)
 
 
 def acting_prefix(policy: BasePolicy) -> str:

@@ -15,14 +15,13 @@ from jbrep.errors import InputError, differences
 from jbrep.records.document import Document, read_document
 from jbrep.records.lock import exclusive
 from jbrep.records.record import Version
-from jbrep.records.storage import exists, inside, make_folder, write_whole
+from jbrep.records.storage import exists, make_folder, write_whole
 from jbrep.rl.files import FINISHED, last_returns, read_evaluations
-from jbrep.rl.job import Job, Session
 from jbrep.rl.learner import preset_text
 from jbrep.rl.overrides import setting_names
 from jbrep.rl.run import Run
 from jbrep.rl.run_settings import RunSettings
-from jbrep.rl.trainers import train_jobs
+from jbrep.rl.training import Session, train
 
 SEARCH, BEST = "search.json", "best.toml"
 _MOST_SEEDS = 1_000
@@ -48,7 +47,7 @@ class Search(Document, frozen=True, kw_only=True):
     """search.json: what is searched, by which all trials and their order are decided."""
 
     format = "jbrep search"
-    format_version = 1
+    format_version = 2
 
     settings: RunSettings  # that all trials begin with
     seeds: Annotated[int, Meta(ge=1)]  # runs of each trial
@@ -152,7 +151,7 @@ def _trial(
     asked = study.ask(_space(run))
     overrides = _overrides(asked.params)
     trained = run.replace(learner=run.learner.overridden(overrides))
-    own = inside(folder, f"trial-{number}")
+    own = folder / f"trial-{number}"
     value = _score(trained, range(run.seed, run.seed + seeds), own, stop)
     study.tell(asked, value, TrialState.FAIL if value is None else TrialState.COMPLETE)
     return Trial(number, overrides, value)
@@ -160,9 +159,10 @@ def _trial(
 
 def _score(run: Run, seeds: range, folder: Path, stop: Callable[[], bool]) -> float | None:
     """The mean return of the last evaluations of a trial's runs; None if one failed."""
-    jobs = [Job(run.replace(seed=seed), inside(folder, f"seed-{seed}")) for seed in seeds]
-    for _, result in train_jobs(jobs, Session(stop=stop)):
-        if result.status != FINISHED:
+    last: list[float] = []
+    for seed in seeds:
+        own = folder / f"seed-{seed}"
+        if train(run.replace(seed=seed), own, Session(stop=stop)).status != FINISHED:
             return None
-    last = [each for job in jobs for each in last_returns(read_evaluations(job.folder))]
+        last += last_returns(read_evaluations(own))
     return float(np.mean(last))

@@ -4,7 +4,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from numbers import Integral
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,6 @@ LARGEST_RETURN = 1e15  # of either sign: beyond, a number has diverged
 _ROUNDING = 1e-6  # of returns, relative to the largest
 # alike for all runs of a task
 _OF_TASK = ("return_floor", "return_ceiling", "reference", "top", "solved")
-_NUMBERS = (*_OF_TASK, "reference_in_training", "top_in_training", "failure_return")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +45,6 @@ class RunCurve:
             task, on the starts of evaluation; None if unknown.
         top_in_training: the same on the starts of `returns`; None if that is `top`.
         solved: the return from which on the task counts as solved; None if unknown.
-        trainer: what trained it, and how exactly; equal for all runs that are compared.
         environment: what decides which returns there can be; equal likewise.
         final: the returns of the last evaluation, if it has more episodes than the others, (f,).
         encoder_seed: of the encoder, if the representation has several.
@@ -71,75 +68,31 @@ class RunCurve:
     top: float | None = None
     top_in_training: float | None = None
     solved: float | None = None
-    trainer: str = ""
     environment: str = ""
     final: Array | None = None
     encoder_seed: int | None = None
     failure_return: float | None = None
 
     def __post_init__(self) -> None:
-        if not _is_whole(self.seed):
-            raise self._error(f"its seed is {self.seed!r}", "it must be a whole number")
-        given, returns = np.asarray(self.steps), np.asarray(self.returns, float)
-        if given.size and not np.issubdtype(given.dtype, np.integer):
-            raise self._error(f"its steps are {given.dtype}", "they must be whole numbers")
-        steps = given.astype(np.int64)
-        if not steps.size and not returns.size:
-            returns = returns.reshape(0, 1)  # failed before the first evaluation
-        if given.ndim != 1 or np.any(np.diff(steps) <= 0):
-            raise self._error("its steps don't ascend", "they must be ascending, (evaluations,)")
-        if returns.ndim != 2 or len(returns) != len(steps) or not returns.shape[1]:
+        if self.failed_at is None and len(self.steps) < 2:
             raise self._error(
-                f"its returns have the shape {returns.shape}",
-                f"expected (evaluations, episodes), with {len(steps)} evaluations as in its steps",
-            )
-        if not (np.abs(returns) <= LARGEST_RETURN).all():
-            raise self._error(
-                f"its returns aren't finite, or beyond {LARGEST_RETURN:g}",
-                "set failed_at for a run that diverged",
-            )
-        self._check_bounds(returns)
-        self._check_length(steps)
-        if self.final is not None and not (np.abs(self.final) <= LARGEST_RETURN).all():
-            raise self._error("its final returns aren't finite", "give numbers, or None")
-        for name, value in (("steps", steps), ("returns", returns.copy())):
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
-
-    def _check_bounds(self, returns: Array) -> None:
-        for what in _NUMBERS:
-            value = getattr(self, what)
-            if value is not None and not abs(value) <= LARGEST_RETURN:
-                raise self._error(f"its {what} is {value}", "give a number, or None if unknown")
-        every = returns if self.final is None else np.append(returns, self.final)
-        if not every.size:
-            return
-        low, high = self.bounds
-        rounding = _ROUNDING * max(1, np.abs(every).max())
-        if every.min() < low - rounding:
-            raise self._error(
-                f"its least return is {every.min():g}", f"its task has none below {low:g}"
-            )
-        if every.max() > high + rounding:
-            raise self._error(
-                f"its largest return is {every.max():g}", f"its task has none above {high:g}"
-            )
-
-    def _check_length(self, steps: NDArray[np.int64]) -> None:
-        if self.failed_at is None and len(steps) < 2:
-            raise self._error(
-                f"its number of evaluations is {len(steps)}",
+                f"its number of evaluations is {len(self.steps)}",
                 "a curve needs at least two; the episodes of one evaluation are not runs",
             )
-        if self.failed_at is not None and not 0 <= self.failed_at <= self.total_steps:
+        every = self.returns if self.final is None else np.append(self.returns, self.final)
+        if every.size:
+            self._check_bounds(float(every.min()), float(every.max()))
+
+    def _check_bounds(self, least: float, largest: float) -> None:
+        rounding = _ROUNDING * max(1, abs(least), abs(largest))
+        if least < self.bounds.low - rounding:
             raise self._error(
-                f"it failed at step {self.failed_at}",
-                f"that must be within 0 to {self.total_steps}",
+                f"its least return is {least:g}", f"its task has none below {self.bounds.low:g}"
             )
-        if len(steps) and not 0 <= steps[0] <= steps[-1] <= self.total_steps:
+        if largest > self.bounds.high + rounding:
             raise self._error(
-                f"it was evaluated at steps {steps[0]} to {steps[-1]}",
-                f"they must be within its total_steps, {self.total_steps}",
+                f"its largest return is {largest:g}",
+                f"its task has none above {self.bounds.high:g}",
             )
 
     @property
@@ -174,10 +127,6 @@ class RunCurve:
         return InputError(f"run {self.label}, seed {self.seed}: {wrong}; {expected}")
 
 
-def _is_whole(value: object) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool)
-
-
 Group = dict[str, list[RunCurve]]  # runs by seed, under their representation
 Key = tuple[str, str]  # task and algorithm
 
@@ -208,12 +157,6 @@ def groups(runs: Sequence[RunCurve], baseline: str) -> dict[Key, Group]:
     The order doesn't depend on that of the runs given. Each run has its failure_return.
     """
     by_group: dict[Key, Group] = defaultdict(lambda: defaultdict(list))
-    for run in runs:
-        if not isinstance(run, RunCurve):
-            raise InputError(
-                f"runs contain a {type(run).__name__}: give one RunCurve for each run; episodes "
-                "don't replace runs"
-            )
     for run in with_failure_returns(runs):
         by_group[run.task, run.algorithm][run.representation].append(run)
     if not by_group:
@@ -253,11 +196,6 @@ def in_order(names: Iterable[str], baseline: str) -> list[str]:
 def _check_task(runs: list[RunCurve], name: str) -> None:
     if runs[0].failure_return is None:
         raise InputError(f"{name}: every run failed before its first evaluation: see why they did")
-    if len(trainers := sorted({run.trainer for run in runs})) > 1:
-        raise InputError(
-            f"{name}: its runs are of different trainers: {', '.join(trainers)}; report those of "
-            "one, or all with --across-trainers"
-        )
     if len(environments := sorted({run.environment for run in runs})) > 1:
         raise InputError(
             f"{name}: its runs are of different environments: {' and '.join(environments)}; report "

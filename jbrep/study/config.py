@@ -25,7 +25,6 @@ from jbrep.records.storage import exists
 from jbrep.records.toml import read_toml, toml_text
 from jbrep.rl.learner import Learner
 from jbrep.rl.presets import learns_from
-from jbrep.rl.run import trainer_of
 from jbrep.rl.settings import MAX_STEPS, Seed, TrainingSettings
 from jbrep.stats.claims import NOT_WORSE
 from jbrep.stats.pairs import FEWEST_UNITS, linked_units
@@ -42,13 +41,7 @@ from jbrep.text import slug
 
 _MOST_SEEDS = (1 << 16) - 1
 UNIFORM = Uniform.kind
-_DataName = Annotated[
-    str,
-    Meta(
-        pattern=r"\A(?=.*[^.])[A-Za-z0-9_.-]{1,100}\Z",
-        title="a name of letters, digits, dots, hyphens and underscores",
-    ),
-]
+_DataName = Annotated[str, Meta(pattern=r"\A(?=.*[^.])[A-Za-z0-9_.-]{1,100}\Z")]
 
 
 class Data(Record, frozen=True, kw_only=True):
@@ -110,13 +103,12 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep study"
-    format_version = 2
+    format_version = 4
 
     tasks: Annotated[
         tuple[str, ...],
         Meta(
             min_length=1,
-            title="a list of names",
             description="The Jitterbug's by name, others by their Gymnasium ids.",
         ),
     ]
@@ -124,7 +116,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         tuple[str, ...],
         Meta(
             min_length=1,
-            title="a list of names, or tables",
             description="ddpg, td3, sac, ppo, a2c, trpo, tqc, crossq, each also with a preset, "
             "sac-modern; or a table of settings for each.",
         ),
@@ -133,7 +124,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         tuple[Given, ...],
         Meta(
             min_length=1,
-            title="a list of names and tables",
             description="full, encoders by name, or tables: name with file, code, kind and its "
             "settings, or encoders.",
         ),
@@ -142,8 +132,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         tuple[Seed, ...],
         Meta(
             min_length=1,
-            title=f"a list of whole numbers, or how many (1 to {_MOST_SEEDS:,})",
-            description="Of the runs.",
+            description="Of the runs, or how many.",
         ),
     ]
     episode_steps: Annotated[
@@ -155,12 +144,9 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     ] = {}
     domain: Annotated[
         Mapping[str, Any] | UnsetType,
-        Meta(
-            title="a table",
-            description='What each episode of all runs draws, such as delay = "0..2".',
-        ),
+        Meta(description='What each episode of all runs draws, such as delay = "0..2".'),
     ] = UNSET
-    data: Annotated[Mapping[str, Any] | None, Meta(title="a table")] = None  # see `named_data`
+    data: Mapping[str, Any] | None = None  # see `named_data`
     training: Annotated[
         Mapping[str, Any],
         Meta(
@@ -173,7 +159,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     evaluations: Annotated[
         tuple[str, ...],
         Meta(
-            title="a list of folders",
             description="From jbrep evaluate, whose diagnostics the report sets against returns; "
             "{task} stands for each task's name.",
         ),
@@ -193,8 +178,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         self._check_tasks()
         Domain(**read_ranges(self.domain or {}))
         for algorithm in self.algorithms:
-            for each in self.learner(algorithm).variants:
-                trainer_of(each, self)
+            self.learner(algorithm)
         self._check_data()
         self._check_verdicts()
 

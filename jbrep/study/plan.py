@@ -1,22 +1,21 @@
 """A study's folder: where its files are, and which runs it has."""
 
-import json
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 
+from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.envs.description import describe
-from jbrep.envs.instances import memory_of_each
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
 from jbrep.records.commit import in_work_tree
 from jbrep.records.document import read_document
 from jbrep.records.record import to_plain
-from jbrep.records.storage import exists, inside, make_folder
+from jbrep.records.storage import exists, make_folder
 from jbrep.rl import Run
 from jbrep.rl.files import RUN, RunRecord
 from jbrep.rl.learner import Learner
@@ -52,11 +51,6 @@ class Cell:
     def label(self) -> str:
         """What it shares with the runs of other seeds: TASK/ALGORITHM/REPRESENTATION."""
         return f"{self.task}/{self.learner.name}/{self.representation.name}"
-
-    @property
-    def kind(self) -> tuple[str, str]:
-        """What it shares with the runs that it can learn together with: task and settings."""
-        return self.task, json.dumps([self.learner.name, self.learner.table], sort_keys=True)
 
     @property
     def name(self) -> str:
@@ -103,7 +97,7 @@ class Plan:
 
     def folder_of(self, cell: Cell) -> Path:
         """A run's folder."""
-        return inside(self.folder, "runs", cell.name)
+        return self.folder / "runs" / cell.name
 
     def has_ended(self, cell: Cell) -> bool:
         """Whether a run has finished or failed."""
@@ -118,11 +112,6 @@ class Plan:
         """A task with the study's arguments, time limit and domain."""
         study = self.study
         return describe(name, study.environment, study.episode_steps, domain=study.domain or {})
-
-    @cached_property
-    def robot_memory(self) -> Callable[[str], int]:
-        """Bytes that each environment of a task takes, by the task's name; measured once."""
-        return cache(lambda name: memory_of_each(self.task(name)))
 
     def run(self, cell: Cell) -> Run:
         """What to train."""
@@ -171,7 +160,7 @@ class Plan:
             for task in self.study.tasks
         }
         there = sorted(folder for folder in folders if exists(folder / MANIFEST))
-        return {str(folder): read_manifest(folder).fingerprint for folder in there}
+        return {str(folder): Dataset(folder).fingerprint for folder in there}
 
     def deviations(self, runs: Collection[RunRecord]) -> list[str]:
         """How what ran differs from what was registered, in sentences; none if nothing was."""
@@ -182,13 +171,13 @@ class Plan:
             *self.registration.other_data(self.policies, self.existing_data),
         ]
 
-    def assigned(self, cells: Iterable[Cell]) -> list[Assigned]:
-        """Runs for a worker."""
-        return [Assigned(cell.name, self.run(cell), self.folder_of(cell)) for cell in cells]
+    def assigned(self, cell: Cell) -> Assigned:
+        """A run for a worker."""
+        return Assigned(cell.name, self.run(cell), self.folder_of(cell))
 
     def encoders(self, task: str) -> Path:
         """The folder of the encoders that the study trains for a task."""
-        return inside(self.folder, "encoders", slug(task))
+        return self.folder / "encoders" / slug(task)
 
     def data(self, task: str, number: int = 0, name: str = "") -> Path:
         """The folder of a data set that the study collects for a task, one of several or alone.
@@ -200,7 +189,7 @@ class Plan:
         """
         several = name in self.study.named_data and self.study.sets(name) > 1
         of_set = [f"set-{number}"] if several else []
-        return inside(self.folder, "data", *([name] if name else []), slug(task), *of_set)
+        return self.folder.joinpath("data", *([name] if name else []), slug(task), *of_set)
 
     def check_folder(self) -> None:
         """Check that the folder is free, or holds this study."""

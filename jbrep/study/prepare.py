@@ -54,7 +54,7 @@ def check(plan: Plan) -> None:
                     f"choose a latent size of at most {largest}"
                 )
     _check_own(plan)
-    of_each = {cell.kind: cell for cell in plan.cells}
+    of_each = {(cell.task, repr(cell.learner)): cell for cell in plan.cells}
     for cell in of_each.values():  # the representation decides no setting of a learner
         run = plan.run(cell).replace(encoder=FULL)
         run.settings(run.find_encoder())

@@ -39,13 +39,7 @@ Layers = Annotated[tuple[Layer, ...], Meta(max_length=100)]
 class LabelSettings(SharedSettings, frozen=True, kw_only=True):
     """The settings that all runs of a label share: without the seed and what depends on it."""
 
-    encoder: Annotated[
-        str,
-        Meta(
-            pattern=f"^([0-9a-f]{{64}}|{EACH_ITS_OWN})$",
-            title=f"64 hexadecimal digits, or {EACH_ITS_OWN!r}",
-        ),
-    ]
+    encoder: Annotated[str, Meta(pattern=f"^([0-9a-f]{{64}}|{EACH_ITS_OWN})$")]
     begin_from: str | None = msgspec.field(name="from")
 
 
@@ -117,8 +111,7 @@ class RunsRecord(Document, frozen=True, kw_only=True):
     """runs.json."""
 
     format = "jbrep runs"
-    format_version = 3
-    max_bytes = 1 << 28
+    format_version = 5
     indent = 1
 
     study: Study | None  # None for runs without one
@@ -259,8 +252,8 @@ def _encoder(folder: Path, run: RunRecord) -> EncoderFacts:
         kind=encoder.kind,
         size=encoder.size,
         latent_size=encoder.latent_size,
-        encoder=tuple((len(layer.bias), layer.activation) for layer in encoder.encoder),
-        decoder=tuple((len(layer.bias), layer.activation) for layer in encoder.decoder),
+        encoder=tuple((layer.units, layer.activation) for layer in encoder.encoder),
+        decoder=tuple((layer.units, layer.activation) for layer in encoder.decoder),
         **{name: getattr(encoder.header, name) for name in ("training", "data", "metrics")},
     )
 

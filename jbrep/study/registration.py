@@ -1,28 +1,31 @@
 """A study's plan, written down before its first run: what a report holds its runs against."""
 
+import hashlib
+import json
 from collections.abc import Collection, Iterable, Mapping
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from jbrep.errors import InputError, differences
+from jbrep.errors import DamageError, InputError, differences
 from jbrep.records.commit import CHANGES, commits, in_work_tree, is_committed
-from jbrep.records.document import Document, read_document
+from jbrep.records.document import Document, document_from, parse_json
 from jbrep.records.record import Version, from_plain, to_plain
-from jbrep.records.storage import exists
+from jbrep.records.storage import exists, read_file
 from jbrep.rl.files import RunRecord
-from jbrep.rl.job import packages
+from jbrep.rl.training import packages
 from jbrep.study.config import Study
 
 REGISTRATION = "registration.json"
+_SEAL = "sha256"
 
 
 class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
     """registration.json, beside a study's file and in its folder."""
 
     format = "jbrep registration"
-    format_version = 2
+    format_version = 3
 
     study: dict[str, Any]  # as it was written
     encoders: dict[str, str]  # SHA-256 of those that are there beforehand, by the name of the run
@@ -41,6 +44,14 @@ class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
     def registered(self) -> Study:
         """The study."""
         return from_plain(self.study, Study, "study")
+
+    @cached_property
+    def sha256(self) -> str:
+        """SHA-256 of its fields, as canonical JSON: its file has it, so that changes are seen."""
+        return seal(to_plain(self))
+
+    def as_json(self) -> dict[str, Any]:
+        return {**super().as_json(), _SEAL: self.sha256}
 
     @classmethod
     def of(cls, study: Study, **beforehand: Any) -> "Registration":
@@ -113,14 +124,32 @@ class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
         return ["some runs were made by other commits of jbrep's code"]
 
 
-def read_registration(folder: Path) -> Registration | None:
-    """What was registered in a folder; None if nothing was.
+def seal(fields: Mapping[str, Any]) -> str:
+    """SHA-256 of plain JSON in its canonical form."""
+    canonical = json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def registration_in(path: Path) -> Registration:
+    """What a file says.
 
     Raises:
-        DamageError: the file was changed since, or is damaged.
+        DamageError: the file was changed since it was written, or is damaged.
     """
+    given = parse_json(read_file(path), path, Registration.format)
+    stated = given.pop(_SEAL, None)
+    found = document_from(given, path, Registration)
+    if stated != found.sha256:
+        raise DamageError(
+            f"{path} was changed after it was written, or is damaged: its checksum doesn't match"
+        )
+    return found
+
+
+def read_registration(folder: Path) -> Registration | None:
+    """What was registered in a folder; None if nothing was."""
     path = folder / REGISTRATION
-    return read_document(path, Registration) if exists(path) else None
+    return registration_in(path) if exists(path) else None
 
 
 def beside(file: Path) -> Path:
@@ -138,7 +167,7 @@ def find_committed(file: Path, study: Study) -> Registration | None:
         raise InputError(
             f"{path} {state}: register the study with --register, commit that file, then run it"
         )
-    found = read_document(path, Registration)
+    found = registration_in(path)
     if differing := found.differences(study):
         raise InputError(
             f"{path} is of another study than {file}: {differing}; register it with --register, "

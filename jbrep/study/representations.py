@@ -23,14 +23,8 @@ Given = str | dict[str, Any]  # a representation in a study's file: a name or a 
 
 MAX_ENCODERS = 1000  # of one representation
 _TASK, _SEED, _ENCODER = "{task}", "{seed}", "{encoder}"  # in a file's path, see ByFile
-_Path = Annotated[str, Meta(min_length=1, title="a path")]
-_OwnName = Annotated[
-    str,
-    Meta(
-        pattern=rf"\A(?!{FULL}\Z)(?=.*[^.])[A-Za-z0-9_.-]{{1,100}}\Z",
-        title=f"a name of letters, digits, dots, hyphens and underscores, and not {FULL}",
-    ),
-]
+_Path = Annotated[str, Meta(min_length=1)]
+_OwnName = Annotated[str, Meta(pattern=rf"\A(?!{FULL}\Z)(?=.*[^.])[A-Za-z0-9_.-]{{1,100}}\Z")]
 
 
 class _Training(Record, frozen=True, kw_only=True):
@@ -121,7 +115,7 @@ class ByFile(Representation, frozen=True, kw_only=True):
         file: its path, or a path for each task.
     """
 
-    file: Annotated[_Path | dict[str, _Path], Meta(title="a path, or a table of paths by task")]
+    file: _Path | dict[str, _Path]
 
     def check(self) -> None:
         """As for `Record`: check the words in braces."""

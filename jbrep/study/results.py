@@ -29,7 +29,7 @@ from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.curves import common_grid
 from jbrep.stats.runs import groups
 from jbrep.stats.scale import BLIND, best_blind
-from jbrep.study.plan import STUDY, read_plan
+from jbrep.study.plan import STUDY, Plan
 from jbrep.study.record import RECORD, LabelSettings, RunFacts, RunsRecord, runs_record
 from jbrep.study.tables import (
     REFERENCE_RETURNS,
@@ -40,6 +40,7 @@ from jbrep.study.tables import (
     RunInfo,
     by_run,
     former_record,
+    hash_of_references,
     read_references,
     table_hashes,
     write_references,
@@ -58,11 +59,8 @@ def write_tables(folder: Path) -> list[Path]:
     Returns:
         The files: every return, what was run, what `info` told, the returns of reference policies.
     """
-    ended, former = _ended(folder), former_record(folder)
-    before, played_on = (former.tables, former.tasks) if former else ({}, {})
-    plan = read_plan(folder)
-    top = plan.study.verdicts.reference if plan else ""
-    references = write_references(_tasks(ended.values()), folder, before, played_on, top)
+    ended, before = _ended(folder), table_hashes(folder)
+    references = hash_of_references(folder, before)
     rows, infos = list(_returns(ended)), list(_of_runs(ended, read_infos))
     tables = {name: before[name] for name in (DIAGNOSTICS,) if name in before}
     tables[RETURNS] = write_rows(folder / RETURNS, rows, Return)
@@ -75,11 +73,20 @@ def write_tables(folder: Path) -> list[Path]:
     return [folder / name for name in names if name != DIAGNOSTICS]
 
 
+def play_references(plan: Plan) -> None:
+    """Play the policies that a study's runs are compared with, on the starts of their ends."""
+    ended, former = map(read_run, runs_below(plan.folder)), former_record(plan.folder)
+    before, played_on = (former.tables, former.tasks) if former else ({}, {})
+    top = plan.study.verdicts.reference
+    sha256 = write_references(_tasks(ended), plan.folder, before, played_on, top)
+    if former and sha256 and before.get(REFERENCE_RETURNS) != sha256:
+        former.replace(tables={**before, REFERENCE_RETURNS: sha256}).write(plan.folder / RECORD)
+
+
 def found(
     record: RunsRecord,
     returns: Sequence[Return],
     references: References,
-    across_trainers: bool = False,
 ) -> tuple[Analysis | None, list[str]]:
     """The statistics of what the tables of a study say, if its runs allow any.
 
@@ -87,7 +94,6 @@ def found(
         record: runs.json.
         returns: returns.csv.
         references: references.csv.
-        across_trainers: compare runs of different trainers, too.
 
     Returns:
         The statistics, None where there are too few runs, or runs that can't be compared; and what
@@ -95,8 +101,6 @@ def found(
     """
     planned = replace(record.planned, prevented=_prevented(record, references))
     runs = _curves(record, returns, references)
-    if across_trainers:
-        runs = [replace(run, trainer="") for run in runs]
     compared, left_out = _comparable(runs, planned.rules.baseline)
     compared, refused = _without_refused(compared, planned.rules.baseline)
     left_out += refused
@@ -225,7 +229,7 @@ def _prevented(record: RunsRecord, references: References) -> dict[str, str]:
     }
     return {
         task: f"what {listed(policies)} would return isn't known, by which returns are scored: "
-        f"make the report where {task} is installed"
+        "jbrep study plays them when it runs"
         for task, policies in unknown.items()
         if policies
     }
@@ -257,7 +261,7 @@ def _curve(
     if drawn:  # the overrides say the hyperparameters
         del settings["hyperparameters"]
         settings["overrides"] = {n: v for n, v in shared.overrides.items() if n not in drawn}
-    trainer = [settings.pop(name) for name in ("trainer", "precision", "device")]
+    del settings["device"]
     steps = sorted(by_step)
     returns = [by_step[step] for step in steps]
     episodes = min(map(len, returns), default=0)  # the last evaluation may have more
@@ -274,7 +278,9 @@ def _curve(
         seed=run.seed,
         settings=hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8],
         steps=np.array(steps, dtype=np.int64),
-        returns=np.array([each[:episodes] for each in returns], dtype=np.float64),
+        returns=np.array([each[:episodes] for each in returns], float).reshape(
+            -1, max(episodes, 1)
+        ),
         total_steps=max(run.steps, shared.steps),
         failed_at=run.steps if run.status == FAILED else None,
         return_floor=task.return_floor,
@@ -284,7 +290,6 @@ def _curve(
         top=_mean(able[: shared.final_episodes]),
         top_in_training=_mean(able[:episodes]),
         solved=task.solved_return,
-        trainer=" ".join(trainer),
         environment=_environment(task),
         final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
         encoder_seed=run.encoder_seed,

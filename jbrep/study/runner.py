@@ -13,14 +13,13 @@ from rich.live import Live
 from rich.table import Table
 
 from jbrep.envs.names import imported_modules
+from jbrep.machine import cores
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
-from jbrep.records.document import read_document
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, make_folder
 from jbrep.rl.files import FAILED, FINISHED, read_run
-from jbrep.rl.job import Job
-from jbrep.rl.settings import CUDA
-from jbrep.study.packing import Pack, packed, usual_workers
+from jbrep.rl.settings import CPU, CUDA
+from jbrep.rl.training import drop_checkpoint, standing_of
 from jbrep.study.plan import STUDY, Cell, Plan
 from jbrep.study.prepare import check, policies, prepare
 from jbrep.study.registration import (
@@ -28,37 +27,44 @@ from jbrep.study.registration import (
     Registration,
     beside,
     find_committed,
+    registration_in,
 )
+from jbrep.study.results import play_references
 from jbrep.study.tables import REFERENCE_RETURNS
 from jbrep.study.work import CRASHED, Outcome, read_progress, say, work
 from jbrep.text import duration
 
 _OWN = STUDY, REGISTRATION, REFERENCE_RETURNS, "data", "encoders", "runs"  # see `make_folder`
 
-Backend = Callable[[Plan, Iterable[Pack], int], Generator[Outcome]]
+Backend = Callable[[Plan, Iterable[Cell], int], Generator[Outcome]]
 
 
-def on_this_machine(plan: Plan, packs: Iterable[Pack], workers: int) -> Generator[Outcome]:
+def usual_workers(plan: Plan) -> int:
+    """How many runs go on at a time: one for each core, or one that has a GPU and all cores."""
+    return cores() if plan.device == CPU else 1
+
+
+def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
     """Bring runs to their end in processes of one thread each; yield the outcomes as they come.
 
-    Runs whose worker is killed are resumed from their checkpoints by others, in packs of half the
-    size, as memory may have run out. One that has lost five workers has crashed. Closed early, this
-    waits until the runs under way have written their checkpoints.
+    A run whose worker is killed is resumed from its checkpoint by another, up to five times. Closed
+    early, this waits until the runs under way have written their checkpoints.
     """
-    waiting, deaths = deque(packs), Counter[str]()
-    with Pool[Pack, list[Outcome] | None](work, workers, _announce_stop) as pool:
+    waiting, deaths = deque(cells), Counter[str]()
+    with Pool[Cell, Outcome | None](work, workers, _announce_stop) as pool:
         while waiting or not pool.is_idle:
             while waiting and not pool.is_full:
-                pack = waiting.popleft()
-                pool.submit(pack, *_job(plan, pack))
-            pack, outcomes = pool.result()
-            if outcomes is not None:
-                yield from outcomes
+                cell = waiting.popleft()
+                pool.submit(cell, *_job(plan, cell))
+            cell, outcome = pool.result()
+            if outcome is not None:
+                yield outcome
                 continue
-            deaths.update(cell.name for cell in pack)
-            yield from (_killed(cell.name) for cell in pack if deaths[cell.name] == ATTEMPTS)
-            left = [cell for cell in pack if deaths[cell.name] < ATTEMPTS]
-            waiting += [half for half in (tuple(left[::2]), tuple(left[1::2])) if half]
+            deaths[cell.name] += 1
+            if deaths[cell.name] == ATTEMPTS:
+                yield _killed(cell.name)
+            else:
+                waiting.append(cell)
 
 
 def _announce_stop() -> None:
@@ -70,7 +76,7 @@ def _killed(name: str) -> Outcome:
     return Outcome(name, CRASHED, f"{reason}: try fewer --workers")
 
 
-def on_ray(plan: Plan, packs: Iterable[Pack], workers: int) -> Generator[Outcome]:
+def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
     """The same on the Ray cluster that RAY_ADDRESS names, or else on a local one.
 
     All nodes need the study's folder at the same path. The runs of a node that dies are resumed on
@@ -80,19 +86,18 @@ def on_ray(plan: Plan, packs: Iterable[Pack], workers: int) -> Generator[Outcome
     import ray
 
     task = on_cluster(work, workers, gpus=int(plan.device == CUDA))
-    under_way = {task.remote(*_job(plan, pack)): pack for pack in packs}
+    under_way = {task.remote(*_job(plan, cell)): cell for cell in cells}
     try:
         while under_way:
             (done,), _ = ray.wait(list(under_way))
-            pack = under_way.pop(done)
+            cell = under_way.pop(done)
             try:
-                outcomes = ray.get(done)
+                yield ray.get(done)
             except ray.exceptions.WorkerCrashedError:
-                outcomes = [_killed(cell.name) for cell in pack]
+                yield _killed(cell.name)
             except ray.exceptions.RayError as error:
                 reason = str(error).strip().rpartition("\n")[2]
-                outcomes = [Outcome(cell.name, CRASHED, reason) for cell in pack]
-            yield from outcomes
+                yield Outcome(cell.name, CRASHED, reason)
     finally:
         for job in under_way:
             ray.cancel(job, force=True)
@@ -101,35 +106,33 @@ def on_ray(plan: Plan, packs: Iterable[Pack], workers: int) -> Generator[Outcome
 BACKENDS: dict[str, Backend] = {"local": on_this_machine, "ray": on_ray}
 
 
-def _job(plan: Plan, pack: Pack) -> tuple[Any, ...]:
+def _job(plan: Plan, cell: Cell) -> tuple[Any, ...]:
     """The arguments of `work`."""
-    return plan.assigned(pack), stop_requested, imported_modules()
+    return plan.assigned(cell), stop_requested, imported_modules()
 
 
 def run_study(
     plan: Plan,
     backend: Backend = on_this_machine,
     workers: int | None = None,
-    width: int | None = None,
 ) -> int:
     """Collect data, train encoders, and train every agent that hasn't been trained yet.
 
     A study with claims is registered first: beside its file, in a commit, where git has that file.
 
-    `jbrep.study.results.write_tables` then writes what came of it.
+    At last the policies play that agents are compared with. `jbrep.study.results.write_tables` then
+    writes what came of it.
 
     Args:
         plan: the study.
         backend: what runs it.
         workers: how many processes go on at a time; by default as many as are usual.
-        width: the most agents that learn together in one.
 
     Returns:
         How many runs crashed.
     """
     check(plan)
     workers, unfinished = workers or usual_workers(plan), plan.unfinished
-    packed(plan, workers, width)  # so that too little memory shows before anything is written
     registered = find_committed(plan.file, plan.study) if plan.file else None
     make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
@@ -139,16 +142,16 @@ def run_study(
         elif plan.study.has_claims and not plan.has_begun:
             _register(plan)
         prepare(plan, workers)
-        packs = packed(plan, workers, width)  # by the sizes of encoders that are there now
         for cell in plan.cells:  # so that any mistake shows before the first run
-            Job(plan.run(cell), plan.folder_of(cell)).clear()
+            if standing_of(plan.run(cell), plan.folder_of(cell)).ended:
+                drop_checkpoint(plan.folder_of(cell))  # it was killed at the very end
         plan.write()  # not before: a study that is refused changes nothing
-        if not unfinished:
-            return 0
         progress = Progress(plan, unfinished)
-        with progress.live, closing(backend(plan, packs, workers)) as outcomes:
-            for outcome in outcomes:
-                progress.report(outcome)
+        if unfinished:
+            with progress.live, closing(backend(plan, unfinished, workers)) as outcomes:
+                for outcome in outcomes:
+                    progress.report(outcome)
+        play_references(plan)
     return progress.counts[CRASHED]
 
 
@@ -170,7 +173,7 @@ def register_study(plan: Plan) -> Path:
                 _register(plan)
         return plan.folder / REGISTRATION
     path = beside(plan.file)
-    if not exists(path) or read_document(path, Registration).registered != plan.study:
+    if not exists(path) or registration_in(path).registered != plan.study:
         plan.check_new()
         _registration(plan).write(path)
     return path

@@ -1,7 +1,9 @@
 """The tables of a study: returns of its runs and of reference policies, diagnostics of encoders."""
 
+import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +11,7 @@ import numpy as np
 
 from jbrep.encoders import FULL
 from jbrep.envs.task import Array, Task
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import DamageError, InputError, Notice
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.table import (
     DIAGNOSTICS,
@@ -114,7 +116,7 @@ def write_references(
 ) -> str | None:
     """Play the reference policies of tasks: three that don't look, and hand-written if there is.
 
-    What the file has already isn't played again; what can't be played here stays in it.
+    What the file has already isn't played again; what can't be played stays in it.
 
     Args:
         tasks: each with its number of episodes.
@@ -141,7 +143,11 @@ def write_references(
             if played_on.get(task.name, task) != task:
                 own = []
             if [row.episode for row in own] != [*range(episodes)]:
-                own = _played(task, policy, episodes) or own
+                try:
+                    own = _played(task, policy, episodes)
+                except Exception as error:  # what has been trained is reported all the same
+                    told = f"policy {policy!r} couldn't be played on {task.name}: {error}"
+                    warnings.warn(told, Notice, stacklevel=2)
             if damage and not own:
                 raise damage
             rows += own
@@ -153,11 +159,21 @@ def references_of(task: Task, episodes: int) -> dict[str, Array]:
 
     There is none of an environment that isn't installed.
     """
-    return {
-        policy: np.array([row.episode_return for row in rows])
-        for policy in _policies(task)
-        if (rows := _played(task, policy, episodes))
-    }
+    found: dict[str, Array] = {}
+    for policy in _policies(task):
+        with suppress(Exception):  # a run is told of all the same
+            rows = _played(task, policy, episodes)
+            found[policy] = np.array([row.episode_return for row in rows])
+    return found
+
+
+def hash_of_references(folder: Path, before: Mapping[str, str]) -> str | None:
+    """The SHA-256 of references.csv, which must be what it was before; None if there is none."""
+    path = folder / REFERENCE_RETURNS
+    if not exists(path):
+        return None
+    read_rows(path, _Reference, before.get(REFERENCE_RETURNS))
+    return hash_of(path.read_text())
 
 
 def read_references(folder: Path, sha256: str | None) -> References:
@@ -191,12 +207,9 @@ def _there(path: Path, before: Mapping[str, str]) -> list[_Reference]:
 
 
 def _played(task: Task, policy: str, episodes: int) -> list[_Reference]:
-    """The rows of a task and policy; none where its environment isn't here."""
-    try:
-        one_by_one = None if task.reproducible else 1  # a robot may exist once
-        returns = find_player(_POLICIES.get(policy, policy), task).returns(episodes, one_by_one)
-    except Exception:  # reports don't need the environments, whatever these lack
-        return []
+    """The rows of a task and policy."""
+    one_by_one = None if task.reproducible else 1  # a robot may exist once
+    returns = find_player(_POLICIES.get(policy, policy), task).returns(episodes, one_by_one)
     return [_Reference(task.name, policy, i, rounded(each)) for i, each in enumerate(returns)]
 
 

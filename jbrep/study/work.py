@@ -3,18 +3,16 @@
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError, first_line
-from jbrep.records.storage import make_folder, read_regular, write_note
-from jbrep.rl import Run, StoppedError
-from jbrep.rl.files import RunRecord
-from jbrep.rl.job import Job, Session
-from jbrep.rl.trainers import train_jobs
+from jbrep.records.storage import make_folder, read_file, write_note
+from jbrep.rl import Run, Session, StoppedError, train
+from jbrep.rl.history import History
 from jbrep.text import rounded
 
 PROGRESS = "progress"
@@ -41,40 +39,29 @@ class Assigned(NamedTuple):
 
 
 def work(
-    assigned: Sequence[Assigned],
+    assigned: Assigned,
     stop: Callable[[], bool] = lambda: False,
     modules: Iterable[str] = (),
-) -> list[Outcome] | None:
-    """Train runs; an error is reported in the outcome of its run and stops no other.
+) -> Outcome | None:
+    """Train a run; an error is reported in its outcome and stops no other run.
 
     Args:
-        assigned: the runs, which go on together where they can.
-        stop: whether to write checkpoints and stop now.
+        assigned: the run.
+        stop: whether to write a checkpoint and stop now.
         modules: to import first, as they register environments.
 
     Returns:
-        How each run ended; None if they were stopped.
+        How the run ended; None if it was stopped.
     """
     try:
-        for each in assigned:
-            make_folder(each.folder)
+        make_folder(assigned.folder)
         import_modules(modules)
-        jobs = [Job(each.run, each.folder) for each in assigned]
-        session = Session(_ProgressFiles(assigned[0].run.steps), stop=stop)
-        results = {job.folder: result for job, result in train_jobs(jobs, session)}
+        watch = _ProgressFile(assigned.folder, assigned.run.steps)
+        result = train(assigned.run, assigned.folder, Session(watch, stop=stop))
     except StoppedError:
         return None
     except Exception as error:
-        if len(assigned) == 1:
-            return [_crashed(assigned[0], error)]
-    else:
-        return [_ended(each, results[each.folder]) for each in assigned]
-    # Now that the error, which held all that they had learned with, is gone: whose was it?
-    alone = [work([each], stop, modules) for each in assigned]
-    return None if None in alone else [outcome for each in alone for outcome in each or ()]
-
-
-def _ended(assigned: Assigned, result: RunRecord) -> Outcome:
+        return _crashed(assigned, error)
     for leftover in (PROGRESS, ERROR):
         (assigned.folder / leftover).unlink(missing_ok=True)
     message = result.reason or f"{result.seconds / 60:.1f} min"
@@ -90,24 +77,23 @@ def _crashed(assigned: Assigned, error: Exception) -> Outcome:
 def read_progress(folder: Path) -> tuple[int, str]:
     """The steps that a run has done, and the mean return of its last evaluation as text."""
     with suppress(InputError, ValueError):
-        step, mean = read_regular(folder / PROGRESS, _MOST_PROGRESS).decode().split()
+        step, mean = read_file(folder / PROGRESS).decode().split()
         return int(step), mean
     return 0, "-"
 
 
-class _ProgressFiles:
-    """Tells the parent process, through files, how far runs are."""
+class _ProgressFile:
+    """Tells the parent process, through a file, how far a run is."""
 
-    def __init__(self, steps: int) -> None:
-        self._steps = steps  # of each run
-        self._written: dict[Path, float] = {}
+    def __init__(self, folder: Path, steps: int) -> None:
+        self._path, self._steps, self._written = folder / PROGRESS, steps, 0.0
 
-    def __call__(self, job: Job, step: int) -> None:
-        now, folder, mean = time.monotonic(), job.folder, job.history.mean
-        if step >= self._steps or now - self._written.get(folder, 0.0) >= _WRITE_EVERY:
-            shown = "-" if mean is None else rounded(mean)[0]
-            write_note(folder / PROGRESS, f"{step} {shown}")
-            self._written[folder] = now
+    def __call__(self, history: History, step: int) -> None:
+        now = time.monotonic()
+        if step >= self._steps or now - self._written >= _WRITE_EVERY:
+            shown = rounded(history.means[-1])[0] if history.evaluations else "-"
+            write_note(self._path, f"{step} {shown}")
+            self._written = now
 
 
 def say(line: str) -> None:

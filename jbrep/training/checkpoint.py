@@ -20,13 +20,7 @@ class _Header(Record, frozen=True, kw_only=True):
 
 
 def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
-    """Write the trainer's state, whole or not at all.
-
-    Args:
-        trainer: after at least one epoch.
-        identity: what must be equal for training to resume; plain JSON.
-        path: the file.
-    """
+    """Write a trainer's state after an epoch, with what must be equal to resume it, plain JSON."""
     tensors = {name: tensor.cpu().numpy() for name, tensor in _state(trainer).items()}
     header = _Header(identity=dict(identity), history=tuple(trainer.history))
     container.write(path, tensors, to_plain(header))
@@ -35,8 +29,7 @@ def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
 def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
     """Put a trainer into the state that the file holds, in place of its own."""
     state = _state(trainer)
-    most = sum(tensor.nbytes for tensor in state.values()) + container.MAX_BYTES
-    tensors, header = container.read(path, "checkpoint", most)
+    tensors, header = container.read(path, "checkpoint")
     try:
         saved = from_plain(header, _Header)
     except InputError:

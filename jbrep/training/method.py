@@ -4,25 +4,28 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
-from msgspec import NODEFAULT, inspect
+from msgspec import NODEFAULT, field, inspect
 from msgspec.structs import asdict, fields, force_setattr
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
-from jbrep.records.record import Record, default_of, from_text, to_plain
-from jbrep.records.words import bare, type_of
-from jbrep.training.network import check_size, get_architecture
-from jbrep.training.objective import Layers, Objective, feature_weights
+from jbrep.records.record import Record, bare, default_of, from_text, to_plain, type_of
+from jbrep.training.network import get_architecture
+from jbrep.training.objective import Layers, Objective
 from jbrep.training.settings import (
-    Architecture,
+    BatchSize,
     Clip,
     Codes,
+    Epochs,
+    FeatureWeights,
     Keep,
     Latent,
+    LearningRate,
     LeaveOut,
     On,
     Scaling,
+    Seed,
 )
 
 
@@ -107,9 +110,7 @@ class Method(Record, frozen=True, kw_only=True):
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
         """How good an encoder is at what the method is for, in words; empty if that isn't known.
 
-        Args:
-            metrics: of the encoder's header.
-            latent: size of its code.
+        By the metrics of its header; `latent` is the size of its code.
         """
         return ""
 
@@ -158,15 +159,12 @@ USUAL: dict[str, Any] = to_plain(Coded.defaults())  # settings of all methods wi
 class Network(Coded, frozen=True, kw_only=True):
     """A method with a network of chosen layers."""
 
-    architecture: Architecture = "deep"
+    if TYPE_CHECKING:  # a field of each class: only one of several bases can have more
+        architecture: str
 
     def __post_init__(self) -> None:
         super().__post_init__()
         force_setattr(self, "architecture", get_architecture(self.architecture).name)
-
-    def check_data(self, data: ScaledDataset) -> None:
-        super().check_data(data)
-        check_size(self.architecture, data.size, self.latent)
 
 
 class ClosedForm(Method, frozen=True, kw_only=True):
@@ -178,13 +176,12 @@ class ClosedForm(Method, frozen=True, kw_only=True):
 
 
 class Learned(Coded, frozen=True, kw_only=True):
-    """A method that trains a network by gradients; the fields named here are in every class."""
+    """A method that trains a network by gradients."""
 
-    if TYPE_CHECKING:  # where the others are, for the order of the header
-        epochs: int
-        batch_size: int | None
-        learning_rate: float
-        seed: int
+    epochs: Epochs = 12
+    batch_size: BatchSize = None
+    learning_rate: LearningRate = 2e-3
+    seed: Seed = 0
 
     def objective(self, data: ScaledDataset) -> Objective:
         """What it trains, on scaled data."""
@@ -194,12 +191,7 @@ class Learned(Coded, frozen=True, kw_only=True):
 class Reconstructing(Learned, frozen=True, kw_only=True):
     """A method that learns to reconstruct rows, with weights of their features."""
 
-    if TYPE_CHECKING:
-        weights: dict[str, float]
-
-    def check_data(self, data: ScaledDataset) -> None:
-        super().check_data(data)
-        feature_weights(data, self.weights)
+    weights: FeatureWeights = field(default_factory=dict)
 
 
 def _read(value: Any, kind: Any, name: str) -> Any:

@@ -1,7 +1,7 @@
 """Networks of dense layers: the paper's, and others."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -13,21 +13,17 @@ from torch import Tensor, nn
 from jbrep.encoders import Layer
 from jbrep.encoders.layers import AVG_L1_NORM, MAX_UNITS, activate
 from jbrep.errors import InputError, choose
-from jbrep.records.container import MAX_BYTES
 
 
 class AvgL1Norm(nn.Module):
     """Divides values (..., units) by their average magnitude."""
 
-    def forward(self, values: Tensor) -> Tensor:
-        """The values on a mean magnitude of 1."""
-        normalised: Tensor = activate(AVG_L1_NORM, values)
-        return normalised
+    def forward(self, values: Tensor) -> Any:
+        return activate(AVG_L1_NORM, values)
 
 
 _MODULES = {"relu": nn.ReLU, "tanh": nn.Tanh, AVG_L1_NORM: AvgL1Norm}
 _SIZES = re.compile(r"[1-9][0-9]{0,8}([x,][1-9][0-9]{0,8})*")
-_BYTES = 4  # of a number in float32
 HIDDEN = 64  # units of each of a predictor's two hidden layers
 _NAMES = {module: name for name, module in _MODULES.items()}
 
@@ -70,36 +66,6 @@ def get_architecture(name: str) -> Architecture:
     return replace(ARCHITECTURES["deep"], name="x".join(map(str, hidden)), hidden=hidden)
 
 
-def check_size(name: str, size: int, latent: int) -> None:
-    """Make sure that a network from `size` features to `latent` units fits an encoder's file.
-
-    Args:
-        name: of its architecture.
-        size: features.
-        latent: units.
-    """
-    architecture = get_architecture(name)
-    widths = (size, *architecture.hidden, latent)
-    needed = 2 * _BYTES * sum(before * after for before, after in pairwise(widths))
-    if needed > MAX_BYTES:
-        raise InputError(
-            f"architecture {architecture.name} has weights of {needed:,} bytes with {size} "
-            f"features: an encoder's file has at most {MAX_BYTES:,}; choose smaller sizes"
-        )
-
-
-def check_layers(*parts: Sequence[Layer] | None) -> None:
-    """Make sure that layers fit an encoder's file."""
-    every = [layer for part in parts for layer in part or ()]
-    needed = _BYTES * sum(layer.weight.size + layer.bias.size for layer in every)
-    widest = max((len(layer.bias) for layer in every), default=0)
-    if needed > MAX_BYTES or widest > MAX_UNITS:
-        raise InputError(
-            f"its layers have {needed:,} bytes and up to {widest:,} units: an encoder's file has "
-            f"at most {MAX_BYTES:,} and {MAX_UNITS:,}; choose a smaller latent size"
-        )
-
-
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
     """Within, torch's generator, which initialises weights, starts from a seed."""
@@ -111,14 +77,9 @@ def seeded(seed: int) -> Iterator[None]:
 def stacks(
     architecture: Architecture, size: int, latent: int, seed: int, initial: str = "torch"
 ) -> tuple[nn.Sequential, nn.Sequential]:
-    """Encoder and decoder, from d numbers to l and back; untrained.
+    """Encoder and decoder, from `size` numbers to `latent` and back; untrained.
 
-    Args:
-        architecture: the layers between.
-        size: numbers d.
-        latent: numbers l.
-        seed: of the weights.
-        initial: `torch` for its initial weights, `normal` for N(0, 1) with biases of 0.
+    The weights are torch's own, or, where `initial` is normal, of N(0, 1) with biases of 0.
     """
     sizes = (size, *architecture.hidden, latent)
     with seeded(seed):

@@ -34,20 +34,16 @@ class Objective(nn.Module, ABC):
     def prepare(self, windows: Windows) -> None:
         """Fit what is constant in training, such as scales of targets, to training windows."""
 
-    @abstractmethod
     def batch(self, windows: Windows, numbers: Tensor) -> Any:
         """What the loss is of: those windows, as a tuple of tensors (n, ...)."""
+        return windows.steps(numbers)
 
     def draws(
         self, windows: Windows, numbers: Tensor, size: int, generator: torch.Generator
     ) -> Iterator[Any]:
         """Batches of at most `size` windows, in order; runs beside the training, a little ahead.
 
-        Args:
-            windows: to train on.
-            numbers: of the windows.
-            size: of a batch.
-            generator: to draw noise from.
+        Noise is drawn from the generator.
         """
         parts = (part.split(size) for part in self.batch(windows, numbers))
         yield from zip(*parts, strict=True)
@@ -67,9 +63,7 @@ class Objective(nn.Module, ABC):
     def rate(self, progress: float, step: int) -> float:
         """What the learning rate is multiplied by: by default falling to 0 along a cosine.
 
-        Args:
-            progress: share of the training that is done.
-            step: gradient steps so far.
+        `progress` is the share of the training that is done, `step` counts gradient steps.
         """
         return (1 + math.cos(math.pi * progress)) / 2
 

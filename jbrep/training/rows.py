@@ -42,13 +42,6 @@ def rows_of(
 
     Both give the same numbers in the same order, and so the same weights. What is read from disk
     is left to the system's cache of files, which gives it up as soon as memory is needed.
-
-    Args:
-        load: from row numbers (n,) to float32, (n, width).
-        rows: row numbers.
-        width: numbers of a row.
-        device: to train on.
-        memory: bytes that they may take.
     """
     if len(rows) * width * np.dtype(np.float32).itemsize <= memory:
         return torch.from_numpy(load(rows)).to(device)
@@ -62,7 +55,6 @@ class _StoredRows:
         self._load, self._numbers, self._device = load, rows, device
 
     def index_select(self, dim: int, index: Tensor, /) -> Tensor:
-        """The rows with those numbers, in that order; `dim` is 0."""
         numbers, place = index.cpu().sort()  # a disk is faster in ascending order
         loaded = torch.from_numpy(self._load(self._numbers[numbers.numpy()])).to(self._device)
         return torch.empty_like(loaded).index_copy_(0, place.to(self._device), loaded)
@@ -75,11 +67,6 @@ def shuffled(count: int, pool: int, generator: torch.Generator) -> Tensor:
     the runs in random order, as many at a time as a pool holds, and their rows shuffled together,
     so that what is read at a time is a pool, whatever the number of rows. The order depends on the
     arguments alone, not on whether the rows are in memory.
-
-    Args:
-        count: number of rows.
-        pool: rows that are shuffled together.
-        generator: to draw from; the numbers will be on its device.
     """
     device = generator.device
     if count <= pool:

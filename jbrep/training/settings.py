@@ -24,17 +24,14 @@ On = Annotated[
 ]
 LeaveOut = Annotated[
     tuple[Ingredient, ...],
-    Meta(
-        title=f"some of {', '.join(INGREDIENTS)}",
-        description=f"Ingredients that coordinates have not: {', '.join(INGREDIENTS)}.",
-    ),
+    Meta(description=f"Ingredients that coordinates have not: {', '.join(INGREDIENTS)}."),
 ]
 Clip = Annotated[
     Annotated[float, Meta(ge=1, le=10**6)] | None,
-    Meta(title="a number from 1 to 1,000,000", description="Limit of scaled values, at least 1."),
+    Meta(description="Limit of scaled values, at least 1."),
 ]
 Latent = Annotated[int, Meta(ge=1, le=MAX_UNITS, description="Latent units l.")]
-Names = tuple[Annotated[str, Meta(min_length=1, title="a name, such as velocity_x")], ...]
+Names = tuple[Annotated[str, Meta(min_length=1)], ...]
 Keep = Annotated[
     Names, Meta(description="Features, or patterns of them, that pass around the encoder.")
 ]
@@ -56,7 +53,6 @@ Epochs = Annotated[int, Meta(ge=1, le=_MAX_SEED, description="Passes over the da
 BatchSize = Annotated[
     Annotated[int, Meta(ge=1, le=_MAX_SEED)] | None,
     Meta(
-        title=f"a whole number from 1 to {_MAX_SEED:,}",
         description="Rows in a batch; by default 128 to 8192, from the rows, unless the method has "
         "its own.",
     ),
@@ -66,17 +62,11 @@ Seed = Annotated[int, Meta(ge=0, le=_MAX_SEED, description="Of everything random
 NoiseDeviation = Annotated[
     float, Meta(ge=0, le=sys.float_info.max, description="Standard deviation of the corruption.")
 ]
-Steps = Annotated[
-    tuple[Annotated[int, Meta(ge=1, le=MAX_HORIZON)], ...],
-    Meta(min_length=1, title=f"steps from 1 to {MAX_HORIZON:,}, such as 10 or 1,5,10"),
-]
+Steps = Annotated[tuple[Annotated[int, Meta(ge=1, le=MAX_HORIZON)], ...], Meta(min_length=1)]
 Weight = Annotated[float, Meta(ge=0, le=10**6)]  # of a part of a loss
 FeatureWeights = Annotated[
     dict[str, Weight],
-    Meta(
-        title="weights of features, such as angle_to_target=4,velocity_x=0.5",
-        description="Weights of features, or of patterns, in the error; 1 otherwise.",
-    ),
+    Meta(description="Weights of features, or of patterns, in the error; 1 otherwise."),
 ]
 RewardWeight = Annotated[Weight, Meta(description="Weight of the reward.")]
 TransitionWeight = Annotated[Weight, Meta(description="Weight of the error of the next code.")]

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from jbrep.records.record import Finite
 from jbrep.training.objective import Objective
 from jbrep.training.rows import POOL, shuffled
 from jbrep.training.windows import Windows
+
+if TYPE_CHECKING:
+    from jbrep.training.method import Learned
 
 _MIN_BATCH, _MAX_BATCH = 128, 8192
 _BATCHES = 400  # that an epoch should have
@@ -64,21 +67,14 @@ def get_device(name: str) -> torch.device:
 
 
 class Trainer:
-    """Trains an objective, an epoch at a time.
+    """Trains an objective, which is on the windows' device, an epoch at a time.
 
     An epoch's order and noise depend on the seed and the epoch's number alone, so that a resumed
-    training gives the same weights as one that was never stopped.
-
-    Args:
-        objective: what to train; on the windows' device.
-        schedule: how long and how fast.
-        windows: to train on.
-        watched: to report the loss on.
-        pool: bytes of rows that are shuffled together; see `jbrep.training.rows.shuffled`.
+    training gives the same weights as one that was never stopped. The loss on `watched` windows is
+    reported; `pool` is bytes of rows that are shuffled together.
 
     Attributes:
-        objective: after the last epoch.
-        optimiser: after the last epoch.
+        objective, optimiser: after the last epoch.
         best: parameters after the epoch with the lowest training loss, or the last one where losses
             can't be compared; held-out rows have no influence on the choice.
         history: the epochs so far.
@@ -87,7 +83,7 @@ class Trainer:
     def __init__(
         self,
         objective: Objective,
-        schedule: Schedule,
+        schedule: "Schedule | Learned",
         windows: Windows,
         watched: Windows,
         pool: int = POOL,

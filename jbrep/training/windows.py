@@ -30,9 +30,6 @@ class Windows:
         device: where what is looked up will be.
         memory: bytes that rows may take: more are read from disk when they are asked for.
         most: windows, at most; a sample of them if there are more.
-
-    Attributes:
-        device: as given.
     """
 
     def __init__(
@@ -112,13 +109,7 @@ class Windows:
 
 
 def first_rows(data: ScaledDataset, rows: NDArray[np.int64], horizon: int) -> NDArray[np.int64]:
-    """Places among the rows of those that have so many rows after them in their episode.
-
-    Args:
-        data: the data set.
-        rows: sorted rows of whole episodes.
-        horizon: rows after one.
-    """
+    """Places among sorted rows of those with so many rows after them in their episode."""
     if not horizon:
         return np.arange(len(rows))
     ends = np.cumsum(data.dataset.episodes["length"], dtype=np.int64)

@@ -41,10 +41,10 @@ def start(*arguments):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def in_this_process(plan, packs, workers):
+def in_this_process(plan, cells, workers):
     """A backend that starts no process and sees what a test has patched."""
-    for pack in packs:
-        yield from work(plan.assigned(pack))
+    for cell in cells:
+        yield work(plan.assigned(cell))
 
 
 def wait_for(happened, process, seconds=120):

@@ -8,10 +8,11 @@ import pytest
 
 from jbrep.encoders import find, save
 from jbrep.encoders.vec_env import agent_spaces
+from jbrep.records import container
 from jbrep.records.tables import write_rows
-from jbrep.report.figures.style import PAPER
+from jbrep.report.figures.panels import PAPER
 from jbrep.rl.agent import Spaces, make_agent, parameters
-from jbrep.rl.checkpoint import CheckpointFile, History, Snapshot
+from jbrep.rl.checkpoint import Header
 from jbrep.rl.files import (
     CHECKPOINT,
     ENCODER,
@@ -22,9 +23,9 @@ from jbrep.rl.files import (
     Evaluation,
     RunRecord,
 )
-from jbrep.rl.job import packages
 from jbrep.rl.learner import Learner
 from jbrep.rl.overrides import check_shape
+from jbrep.rl.training import packages
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import EncoderFacts, Label, LabelSettings
@@ -64,7 +65,7 @@ def label_of(task, representation, encoder=(), decoder=(), kind="dae", latent_si
         **{"algorithm": "sac", "preset": "paper", "learner": "sac", "overrides": {}},
         **{"hyperparameters": learner.hyperparameters, "encoder": "0" * 64, "encoder_code": None},
         **{"steps": 20_000, "evaluate_every": 2000, "evaluation_episodes": 2, "final_episodes": 2},
-        **{"trainer": "sb3", "device": "cpu", "begin_from": None},
+        **{"device": "cpu", "begin_from": None},
     )
     facts = EncoderFacts(
         **{"name": representation, "kind": kind, "size": task.size, "latent_size": latent_size},
@@ -83,9 +84,9 @@ def returns_of(runs):
     ]
 
 
-def drawn(plot, style=PAPER):
-    with mpl.rc_context(style):
-        return plot.draw()
+def drawn(plot):
+    with mpl.rc_context(PAPER):
+        return plot.draw(plot.rows)
 
 
 def make_runs(plan, seeds):
@@ -120,7 +121,7 @@ def of_a_commit():
     """Code and registrations are of a commit in here, also where a contributor has changed some."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Plan, "in_git", True)
-        for module in ("jbrep.study.registration", "jbrep.rl.job"):
+        for module in ("jbrep.study.registration", "jbrep.rl.training"):
             patch.setattr(f"{module}.commits", lambda: COMMITS)
         yield
 
@@ -147,7 +148,12 @@ def write_checkpoint(folder, run, step):
     spaces = Spaces(*agent_spaces(run.task, encoder))
     agent = make_agent(run.learner.algorithm, shape, spaces, run.seed)
     tensors = {f"parameters.{name}": each.numpy() for name, each in parameters(agent)}
-    file = CheckpointFile(folder / CHECKPOINT, run.settings(encoder), packages(), History())
-    file.write(Snapshot(tensors, {"num_timesteps": step}))
+    header = Header(
+        settings=run.settings(encoder),
+        versions=packages(),
+        step=step,
+        **{"episodes": [], "evaluations": [], "infos": [], "seconds": 1.0, "counters": {}},
+    )
+    container.write(folder / CHECKPOINT, tensors, header.as_json())
     save(encoder, folder / ENCODER)
     return agent

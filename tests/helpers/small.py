@@ -4,10 +4,10 @@ import hashlib
 import json
 
 from jbrep.collect import write_shards
-from jbrep.dataset import DataSettings
-from jbrep.dataset.manifest import open_shard, read_manifest
+from jbrep.collect.derive import _each_shard
+from jbrep.dataset import Dataset, DataSettings
+from jbrep.dataset.manifest import read_manifest
 from jbrep.envs import describe
-from jbrep.records.document import sealed
 
 ONE_EACH = {"evaluation_episodes": 1, "final_episodes": 1}  # of a run, in each of its evaluations
 
@@ -35,15 +35,11 @@ def assert_same_files(one, other, *names):
         assert (one / name).read_bytes() == (other / name).read_bytes(), name
 
 
-def write_again(source, folder):
-    """Commit the shards of a data set to another folder, as a collector would."""
-    manifest = read_manifest(source)
-
-    def produce(first, missing, tick):
-        for shard in range(first, len(manifest.shards)):
-            yield open_shard(source, manifest, shard)
-
-    return write_shards(manifest.settings, folder, produce)
+def write_again(source, folder, change=lambda columns: columns):
+    """Write the shards of a data set to another folder, as a collector would, or changed ones."""
+    dataset = Dataset(source)
+    write_shards(dataset.manifest.settings, folder, _each_shard(dataset, change))
+    return read_manifest(folder)
 
 
 def flip_bit(path, bit):
@@ -54,8 +50,8 @@ def flip_bit(path, bit):
 
 
 def forge(path, record):
-    """Write a document as a stranger can, with the right checksum, of whatever it says."""
-    path.write_text(json.dumps(sealed(record)))
+    """Write a document of whatever it says."""
+    path.write_text(json.dumps(record))
 
 
 def adopt(document, *names):

@@ -23,7 +23,6 @@ from jbrep.cli import main
 from jbrep.collect import collect
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export, open_source
-from jbrep.dataset.manifest import read_manifest
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.envs.names import environment_versions
@@ -31,10 +30,9 @@ from jbrep.records.document import read_document
 from jbrep.report import make_report
 from jbrep.report.report import STATISTICS, SUMMARY
 from jbrep.report.tables import read_tables
-from jbrep.rl import Run
+from jbrep.rl import Run, Session, train
+from jbrep.rl.checkpoint import Checkpoint
 from jbrep.rl.files import CHECKPOINT, ENCODER, EVALUATIONS, POLICY, RUN
-from jbrep.rl.job import Job, Session
-from jbrep.rl.trainers import train_jobs
 from jbrep.rl.tune import BEST, SEARCH
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan
@@ -146,41 +144,31 @@ def command_or_refusal(*arguments):
 
 
 def _run(algorithm, **settings):
-    """Two runs that write a checkpoint at every step; in a cohort, together."""
-    runs = [
-        Run.of(task=PENDULUM, algorithm=algorithm, steps=32, seed=seed, **LAST, **settings)
-        for seed in (0, 1)
-    ]
-
-    def jobs(folder):
-        return [Job(run, folder / f"seed-{run.seed}") for run in runs]
+    """A run that writes a checkpoint before every rollout."""
+    run = Run.of(task=PENDULUM, algorithm=algorithm, steps=32, **LAST, **settings)
 
     def act(folder):
-        list(train_jobs(jobs(folder), Session(save_every=0)))
+        train(run, folder, Session(save_every=0))
 
     def result(folder):
-        return [digest(job.folder / POLICY, job.folder / EVALUATIONS) for job in jobs(folder)]
+        return digest(folder / POLICY, folder / EVALUATIONS)
 
     def files(folder):
-        """Checkpoints, of runs that are stopped on the way."""
+        """The checkpoint of a run that is stopped on the way."""
         half = folder / "half"
         if not half.exists():
             asked = iter(range(100))
             try:
-                list(train_jobs(jobs(half), Session(save_every=0, stop=lambda: next(asked) > 1)))
+                train(run, half, Session(save_every=0, stop=lambda: next(asked) > 1))
             except Exception as error:
                 assert type(error).__name__ == "StoppedError"  # noqa: PT017
-        return sorted(half.rglob(CHECKPOINT))
+        return [half / CHECKPOINT]
 
     def read(folder):
         """What a checkpoint says; it is read whole before training goes on."""
         files(folder)
-        found = [job.checkpoint.read() for job in jobs(folder / "half")]
-        return [
-            ({name: each.tobytes() for name, each in one.tensors.items()}, one.counters)
-            for one in found
-            if one
-        ]
+        found = Checkpoint.read(folder / "half")
+        return {name: each.tobytes() for name, each in found.tensors.items()}, found.header
 
     return Surface(act, result, files, read)
 
@@ -195,7 +183,7 @@ def _import(to, path, options=(), **how):
         command("data", "import", path, *options, "--out", folder / "it")
 
     def result(folder):
-        return read_manifest(folder / "it").fingerprint
+        return Dataset(folder / "it").fingerprint
 
     def copied(folder):
         """What is damaged is a copy."""
@@ -221,9 +209,10 @@ def _import(to, path, options=(), **how):
         finally:
             left = [each.name for each in out.parent.iterdir()]
             assert left in ([], ["it"]), left
-        manifest = read_manifest(out)
+        dataset = Dataset(out)
+        found = dataset.fingerprint, dataset.manifest.settings.as_json()
         shutil.rmtree(out)
-        return manifest.fingerprint, manifest.settings.as_json()
+        return found
 
     return Surface(act, result, files, read, **how)
 
@@ -359,7 +348,7 @@ SHORT_RUN = (
 )
 SURFACES = {  # by name, what makes them of `Shared`
     "tune": lambda shared: _tune(),
-    "checkpoints of sac": lambda shared: _run("sac", overrides=CHEAP, trainer="cohort"),
+    "checkpoints of sac": lambda shared: _run("sac", overrides=CHEAP),
     "checkpoints of ppo": lambda shared: _run(
         "ppo", overrides={**SMALL, "n_steps": 8, "batch_size": 8}
     ),

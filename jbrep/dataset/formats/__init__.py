@@ -16,7 +16,7 @@ from jbrep.dataset.formats.episodes import CLOCKS, Source
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.errors import InputError, choose
-from jbrep.records.storage import check_allocation, check_space, exists
+from jbrep.records.storage import check_space, exists
 from jbrep.text import counted
 
 if TYPE_CHECKING:
@@ -75,9 +75,7 @@ def export(dataset: "Dataset", to: str, out: Path) -> str:
         out.parent.mkdir(parents=True, exist_ok=True)
         rows = len(dataset) * dataset.manifest.settings.row_bytes()
         episodes = dataset.manifest.episodes * module.EPISODE_BYTES
-        # HDF5 crashes where a file can't grow, perhaps after the last word of Python
-        check = check_allocation if to == "minari" else check_space
-        check(out.parent, rows + episodes + _FILE_BYTES)
+        check_space(out.parent, rows + episodes + _FILE_BYTES)
         how: str = module.write(dataset, out)
     except (OSError, RuntimeError) as error:  # HDF5 raises the latter when the disk is full
         reason = getattr(error, "strerror", None) or error  # some have only a text

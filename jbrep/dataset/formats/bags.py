@@ -19,7 +19,6 @@ from jbrep.dataset.formats.tables import Table
 from jbrep.dataset.layout import Layout
 from jbrep.envs.task import MAX_FEATURES
 from jbrep.records.record import MOST_WHOLE
-from jbrep.records.storage import check_plain
 
 _TIME = "time"
 _DEEPEST = 8  # messages in messages
@@ -42,7 +41,6 @@ class _Message(NamedTuple):
 def open_table(given: str) -> Table:
     """Open a .bag of ROS 1, an .mcap or .db3, or the folder of a bag of ROS 2."""
     path, columns, unknown, late = Path(given), list[str](), list[str](), dict[str, str]()
-    check_plain(path)
     with opened(path) as reader:
         for topic in sorted(reader.topics):
             messages = islice(_messages(reader, {topic}), _PEEKED)

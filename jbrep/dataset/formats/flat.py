@@ -152,7 +152,7 @@ def _ends(name: str, before: list[Rows], rows: Rows) -> list[int]:
 
 
 def source_of(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) -> Source:
-    """Arrays in Python, see `Dataset.write`.
+    """Arrays in Python, see `from_arrays`.
 
     Args:
         columns: by their names in `ALIASES`: a row for each step of all episodes, or a list with

@@ -21,17 +21,10 @@ from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
 from jbrep.errors import InputError, refusing
 from jbrep.progress import Progress
-from jbrep.records.storage import (
-    check_plain,
-    publish_folder,
-    read_regular,
-    unfinished,
-    write_whole,
-)
+from jbrep.records.storage import publish, read_file, unfinished, write_whole
 
 EPISODE_BYTES = 1 << 10  # in the table of episodes
 INFO = "meta/info.json"
-_MAX_BYTES = 1 << 24  # of it
 _VERSIONS = ("v3", "v2")
 _FILE_ROWS = 1 << 20  # of what is written
 _CHUNK_FILES = 1000
@@ -45,7 +38,6 @@ _NUMBERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 def open_table(given: str) -> Table:
     """Open a data set by its folder."""
     folder = Path(given)
-    check_plain(folder)
     info = _info(folder / INFO)
     paths = sorted(folder.glob("data/*/*.parquet"))
     if not paths:
@@ -86,7 +78,7 @@ def open_table(given: str) -> Table:
 
 def _info(path: Path) -> dict[str, Any]:
     """What the data set says of itself, as far as it is used."""
-    raw = read_regular(path, _MAX_BYTES)
+    raw = read_file(path)
     errors = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
     with refusing(f"{path} isn't as LeRobot writes it", errors):
         info = json.loads(raw)
@@ -132,7 +124,7 @@ def write(dataset: Dataset, out: Path) -> str:
         (partial / "meta").mkdir(parents=True)
         files = _write_steps(dataset, partial, fps)
         _write_meta(dataset, partial, files, fps)
-        publish_folder(partial, out)
+        publish(partial, out)
     return f"LeRobotDataset({out.name!r}, root={str(out)!r})"
 
 

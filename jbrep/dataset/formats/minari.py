@@ -32,21 +32,19 @@ from jbrep.dataset.formats.hdf5 import opened
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.rewards import without_range
 from jbrep.dataset.schema import UNKNOWN_SEED, DataSettings
-from jbrep.envs.description import describe, features_of
+from jbrep.envs.description import describe
 from jbrep.envs.names import spec_of
+from jbrep.envs.probe import features_of
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, kind_and_line, listed, refusing
 from jbrep.progress import Progress
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Finite, Sha256
 from jbrep.records.storage import (
-    check_plain,
     exists,
-    inside,
     make_folder,
-    open_regular,
-    publish_folder,
-    read_regular,
+    publish,
+    read_file,
     unfinished,
     write_whole,
 )
@@ -54,7 +52,6 @@ from jbrep.records.storage import (
 Array = NDArray[Any]
 _ROOT = "MINARI_DATASETS_PATH"  # Minari takes the folder of its data sets from there only
 _METADATA, _CHECKSUMS = "metadata.json", "jbrep.json"
-_MAX_BYTES = 1 << 24  # of the metadata
 _WORD = re.compile(r"[\w-]{1,40}")
 EPISODE_BYTES = 1 << 14  # that HDF5 takes for each episode besides its rows
 
@@ -66,7 +63,7 @@ class Checksums(Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep export"
-    format_version = 1
+    format_version = 2
 
     files: Mapping[str, Sha256]
     offsets: tuple[Finite, ...] = ()
@@ -136,11 +133,10 @@ def _check_files(folder: Path) -> Checksums | None:
     Raises:
         DamageError: one isn't what was exported.
     """
-    check_plain(folder)
     known = read_document(folder / _CHECKSUMS, Checksums) if exists(folder / _CHECKSUMS) else None
     if known:
         for name, sha256 in known.files.items():
-            if _sha256(inside(folder, name)) != sha256:
+            if _sha256(folder / name) != sha256:
                 raise DamageError(
                     f"{folder / name} is damaged: it isn't what was exported, by its checksum; "
                     "export the data set again"
@@ -152,18 +148,14 @@ def _check_files(folder: Path) -> Checksums | None:
 
 
 def _sha256(path: Path) -> str:
-    """Of a regular file; empty where there is none."""
-    file = open_regular(path) if exists(path) else None
-    if file is None:
-        return ""
-    with file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Of a file; empty where there is none."""
+    return hashlib.sha256(read_file(path)).hexdigest() if exists(path) else ""
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
     """What the data set says of itself."""
     path = folder / _METADATA
-    raw = read_regular(path, _MAX_BYTES)
+    raw = read_file(path)
     with refusing(f"{path} can't be read", (ValueError, KeyError, TypeError, RecursionError)):
         metadata = json.loads(raw)
         spaces_of = [metadata["observation_space"], metadata["action_space"]]
@@ -269,7 +261,7 @@ def write(dataset: Dataset, out: Path) -> str:
     """Add a data set to a folder of Minari data sets; returns how to open it."""
     settings = dataset.manifest.settings
     name = f"{_namespace(settings.task)}/{settings.policy['kind']}-v0"
-    path, spec = inside(out, name), _env_spec(settings)
+    path, spec = out / name, _env_spec(settings)
     dataset["reward"]  # says what to do if there are none
     make_folder(path.parent)
     with unfinished(path) as root:  # Minari ignores hidden folders
@@ -282,7 +274,7 @@ def write(dataset: Dataset, out: Path) -> str:
             metadata = namespace / NAMESPACE_METADATA_FILENAME
             if not exists(out / metadata):
                 write_whole(out / metadata, (root / metadata).read_bytes())
-        publish_folder(root / name, path)
+        publish(root / name, path)
     return f"{_ROOT}={out} and minari.load_dataset({name!r})"
 
 
@@ -311,7 +303,7 @@ def _create(dataset: Dataset, name: str, spec: EnvSpec | None) -> None:
         observation_space=spaces.Box(-np.inf, np.inf, (task.size,), np.float32),
         action_space=spaces.Box(low, high, dtype=np.float32),
         algorithm_name=settings.policy["kind"],
-        description=f"{json.dumps(settings.as_json())} {dataset.manifest.fingerprint}",
+        description=f"{json.dumps(settings.as_json())} {dataset.fingerprint}",
         requirements=[f"{package}=={versions[package]}" for package in ("jbrep", "mujoco")],
     )
 

@@ -19,7 +19,7 @@ from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Feature
 from jbrep.errors import DamageError, InputError, refusing
 from jbrep.progress import Progress
-from jbrep.records.storage import publish_file, unfinished
+from jbrep.records.storage import publish, unfinished
 from jbrep.text import words
 
 Array = NDArray[Any]
@@ -241,7 +241,7 @@ def write(dataset: Dataset, out: Path) -> str:
     """Stream the columns to an uncompressed zip; returns how to open it."""
     with unfinished(out) as partial:
         _write_zip(dataset, partial, out.name)
-        publish_file(partial, out)
+        publish(partial, out)
     return f"numpy.load({str(out)!r})"
 
 

@@ -25,12 +25,12 @@ from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import MAX_FEATURES, Task
 from jbrep.errors import DamageError, InputError, first_line, refusing
 from jbrep.progress import Progress
-from jbrep.records.document import Document, document_in
+from jbrep.records.document import Document, document_from, parse_json
 from jbrep.records.record import Sha256, from_plain
 from jbrep.records.storage import (
     exists,
-    publish_file,
-    read_regular,
+    publish,
+    read_file,
     taken,
     unfinished,
     write_whole,
@@ -39,7 +39,6 @@ from jbrep.records.storage import (
 EPISODE_BYTES = 0  # besides its rows
 _SETTINGS, _CHECKSUMS = b"jbrep", b"jbrep checksums"  # in a file's metadata
 _MAX_COLUMNS = 1 << 14
-_MAX_BYTES = 1 << 31  # of the file of episodes
 _ROW_BYTES = 64  # of a number in a column, before compression, at most
 _LIST_BYTES = 8 * MAX_FEATURES  # of a list of them
 
@@ -48,7 +47,7 @@ class Checksums(Document, frozen=True, kw_only=True):
     """What a table that was exported says of itself, in its metadata."""
 
     format = "jbrep table"
-    format_version = 1
+    format_version = 2
 
     settings: Sha256  # of the text of the data set's settings, also in the metadata
     columns: Mapping[str, str]  # XXH3 of the numbers of each
@@ -109,7 +108,8 @@ def _checksums(path: Path, metadata: Mapping[bytes, bytes]) -> Checksums | None:
     """What jbrep wrote into a table; None of any other file's."""
     if not {_SETTINGS, _CHECKSUMS} & metadata.keys():
         return None
-    known = document_in(metadata.get(_CHECKSUMS, b""), path, Checksums)
+    given = parse_json(metadata.get(_CHECKSUMS, b""), path, Checksums.format)
+    known = document_from(given, path, Checksums)
     if hashlib.sha256(metadata.get(_SETTINGS, b"")).hexdigest() != known.settings:
         raise _damaged(path, "its settings")
     return known
@@ -158,7 +158,7 @@ def _once(path: Path, known: Checksums, rows: int) -> dict[str, NDArray[Any]]:
     beside = _beside(path)
     if not exists(beside):
         raise InputError(f"{beside} is missing: it belongs to {path}, and must stand beside it")
-    content = read_regular(beside, _MAX_BYTES)
+    content = read_file(beside)
     if hashlib.sha256(content).hexdigest() != known.episodes:
         raise DamageError(
             f"{beside} is damaged, or of another data set than {path}: export the data set again"
@@ -181,12 +181,12 @@ def write(dataset: Dataset, out: Path) -> str:
     with unfinished(out) as partial:
         beside, episodes = _beside(out), _episodes(dataset)
         is_there = exists(beside)
-        if is_there and read_regular(beside, _MAX_BYTES) != episodes:
+        if is_there and read_file(beside) != episodes:
             raise taken(beside)
         _write_steps(dataset, partial, out.name, hashlib.sha256(episodes).hexdigest())
         write_whole(beside, episodes)
         try:
-            publish_file(partial, out)
+            publish(partial, out)
         except BaseException:
             if not is_there:
                 beside.unlink()

@@ -21,13 +21,13 @@ from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
 from jbrep.dataset.verify import range_problems
-from jbrep.envs.description import features_of, with_features
-from jbrep.envs.precision import Signals, precision_problems
+from jbrep.envs.description import with_features
+from jbrep.envs.probe import Signals, features_of, precision_problems
 from jbrep.envs.task import Missing, Task
 from jbrep.errors import InputError, Notice, kind_and_line
 from jbrep.progress import Progress
 from jbrep.records.record import converted
-from jbrep.records.storage import check_space, make_folder, publish_folder, unfinished
+from jbrep.records.storage import check_space, make_folder, publish, unfinished
 from jbrep.text import counted, printable
 
 _SHARD_ROWS = 20_000
@@ -89,7 +89,7 @@ def write(
             check_space(folder.parent, settings.steps * settings.row_bytes())
             partial.mkdir()
             manifest = _fill(source, settings, partial)
-            publish_folder(partial, folder)
+            publish(partial, folder)
     except OSError as error:
         raise InputError(f"can't write {folder}: {error.strerror or error}") from error
     return manifest

@@ -1,142 +1,109 @@
 """Figures of encoders, from their evaluation."""
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
 from jbrep.encoders import FULL
-from jbrep.evaluate.evaluation import Evaluation, FeatureError, Reconstruction
-from jbrep.report.figures.curves import below
-from jbrep.report.figures.methods import method_plots
-from jbrep.report.figures.plot import Plot
-from jbrep.report.figures.prediction import MOST, heat_map, least, prediction_plots
-from jbrep.report.figures.style import (
-    COLUMN,
-    draw_line,
-    family,
-    family_styles,
-    plain,
-    reference,
-)
+from jbrep.evaluate.evaluation import Diagnostics, Evaluation
+from jbrep.report.figures.panels import COLUMN, Plot, Row, by, line, panels, plain, styles
+from jbrep.text import r2_text
 
-_ERROR = ("mse", "low", "high")
-_Encoders = Mapping[str, "_Decoding"]  # by label
+MOST = 40  # features in a picture
+_SUMS = {"mean": "mean of features", "reward": "reward"}  # of a prediction, in words
+_LOWEST, _HIGHEST = -0.1, 1.03  # R² on an axis
+_CHARACTER = 0.06  # of a title [inches]
 
 
 def encoder_plots(evaluation: Evaluation) -> list[Plot]:
-    """What codes predict, what encoders lose, what methods say.
-
-    What encoders lose is drawn of those that decode; errors against latent size are drawn if one of
-    their latents is smaller than the observation.
-    """
-    task = evaluation.data.task
-    everything = evaluation.encoders
-    encoders = {label: e for label, e in everything.items() if label != FULL}
-    decoding = {
-        label: _Decoding(e.latent, e.reconstruction)
-        for label, e in encoders.items()
-        if e.reconstruction
-    }
-    plots = prediction_plots(task, everything)
-    plots += [_error_by_feature(task, decoding)] if decoding else []
-    if decoding and _sizes(decoding):
-        plots.append(_error_by_latent(task, decoding))
-    return [*plots, *method_plots(task, encoders)]
-
-
-class _Decoding(NamedTuple):
-    """What is drawn of an encoder that decodes."""
-
-    latent: int
-    error: Reconstruction
-
-
-def _sizes(encoders: _Encoders) -> list[int]:
-    """The latent sizes that are smaller than the observation."""
-    size = len(_features(encoders))
-    return sorted({e.latent for e in encoders.values() if e.latent < size})
-
-
-def _features(encoders: _Encoders) -> tuple[FeatureError, ...]:
-    """The features, as the first of the encoders loses them."""
-    return next(iter(encoders.values())).error.features
-
-
-def _error_by_feature(task: str, encoders: _Encoders) -> Plot:
-    """R^2 of each feature (rows) for each encoder (columns)."""
-    count = len(_features(encoders))
-    part = f" Of {count} features the {MOST} worst are shown; all are in the table."
-    return Plot(
-        "error_by_feature",
-        f"{task}: reconstruction of each feature",
-        "R² of each feature's reconstruction on held-out episodes."
-        + (part if count > MOST else ""),
-        ("encoder", "feature", "r2", "low", "high"),
-        [
-            (label, feature.name, *feature.r2)
-            for label, e in encoders.items()
-            for feature in e.error.features
-        ],
-        lambda: _draw_features(task, encoders),
+    """What codes predict, by feature and by steps ahead, and what encoders that decode lose."""
+    task, encoders = evaluation.data.task, evaluation.encoders
+    horizon = encoders[FULL].horizon if FULL in encoders else None
+    predicted, lost = [*_predicted(encoders)], [*_lost(encoders)]
+    ahead = [row for row in predicted if row["steps"] == horizon]
+    sums = [row for row in predicted if row["target"] in _SUMS.values()]
+    most = f" Of more than {MOST} features those with the least are shown; all are in the table."
+    plots = (
+        Plot(
+            "prediction_by_feature",
+            f"{task}: what can be predicted {horizon} steps ahead",
+            f"R² of each feature's change over {horizon} steps, and of the mean reward over them, "
+            "predicted from the code and the actions taken meanwhile, on held-out episodes. What a "
+            f"code can't predict but {FULL} can, an agent that sees the code can't control.{most}",
+            ahead,
+            partial(_heat_map, title=f"{task}: prediction over {horizon} steps"),
+        ),
+        Plot(
+            "prediction_by_horizon",
+            f"{task}: prediction by steps ahead",
+            "R² of the changes over so many steps, averaged over features, and of the mean reward "
+            "over them, predicted from the code and the actions taken meanwhile, on held-out "
+            f"episodes; bars: 95 % intervals over episodes. What is below {_LOWEST} isn't shown.",
+            sums,
+            partial(
+                panels,
+                looks=styles(encoders, FULL),
+                title=lambda key: f"{task}: {key[0]}",
+                mark=line("steps", "r2", "low", "high", bars=True),
+                facet=("target",),
+                series="encoder",
+                axis_labels=("steps ahead", "R² on held-out episodes"),
+                limits={(each,): (_LOWEST, _HIGHEST) for each in _SUMS.values()},
+            ),
+        ),
+        Plot(
+            "error_by_feature",
+            f"{task}: reconstruction of each feature",
+            f"R² of each feature's reconstruction on held-out episodes.{most}",
+            lost,
+            partial(_heat_map, title=f"{task}: reconstruction of each feature"),
+        ),
     )
+    return [plot for plot in plots if plot.rows]
 
 
-def _draw_features(task: str, encoders: _Encoders) -> Figure:
-    features = _features(encoders)
-    values = np.array([[f.r2.value for f in e.error.features] for e in encoders.values()], float).T
-    worst = least(np.nan_to_num(values, nan=1).mean(axis=1))  # what never varies isn't the worst
-    names = [features[i].name for i in worst]
-    which = (
-        "each feature"
-        if len(names) == len(features)
-        else f"the {MOST} worst of {len(features)} features"
-    )
-    title = f"{task}:\nreconstruction of {which}"
-    return heat_map(values[worst], names, list(encoders), title)
+def _predicted(encoders: Mapping[str, Diagnostics]) -> Iterator[Row]:
+    for label, known in encoders.items():
+        for steps, scores in known.prediction.items():
+            sums = {words: getattr(scores, name) for name, words in _SUMS.items()}
+            for target, (value, low, high) in {**scores.features, **sums}.items():
+                key = {"encoder": label, "steps": int(steps), "target": target}
+                yield {**key, "r2": value, "low": low, "high": high}
 
 
-def _error_by_latent(task: str, encoders: _Encoders) -> Plot:
-    """Error against latent size, a line for each family of encoders, and PCA's."""
-    return Plot(
-        "error_by_latent",
-        f"{task}: error against latent size",
-        "Mean squared error of the reconstruction on held-out episodes, features scaled to "
-        "[-1, 1]; bars: 95 % intervals over episodes. Dashed: PCA with as many components.",
-        ("encoder", "latent", *_ERROR, "pca_mse"),
-        [(label, e.latent, *e.error.mse, e.error.pca_mse.value) for label, e in encoders.items()],
-        lambda: _draw_sizes(task, encoders),
-    )
+def _lost(encoders: Mapping[str, Diagnostics]) -> Iterator[Row]:
+    for label, known in encoders.items():
+        for feature in known.reconstruction.features if known.reconstruction else ():
+            value, low, high = feature.r2
+            yield {"encoder": label, "target": feature.name, "r2": value, "low": low, "high": high}
 
 
-def _draw_sizes(task: str, encoders: _Encoders) -> Figure:
-    figure = Figure(figsize=(COLUMN, 2.9))
+def _heat_map(rows: Sequence[Row], title: str) -> Figure:
+    """A cell for the R² of each target and encoder, coloured from 0 to 1."""
+    columns, targets = by(rows, "encoder"), by(rows, "target")
+    scores = {key: own[0]["r2"] for key, own in by(rows, "target", "encoder").items()}
+    values = np.array([[scores[*row, *each] for each in columns] for row in targets], float)
+    sums = [name in _SUMS.values() for (name,) in targets]
+    order = np.lexsort((np.nan_to_num(values, nan=1).mean(axis=1), ~np.array(sums)))
+    shown = np.sort(order[: MOST + sum(sums)])  # in the order of the observation
+    width = max(COLUMN, 1.7 + 0.29 * len(columns))
+    figure = Figure(figsize=(width, 1.0 + 0.16 * len(shown)))
     axes: Axes = figure.subplots()
-    sizes = _sizes(encoders)
-    families = _families(encoders)
-    for name, style in family_styles(families).items():
-        of_size = dict(sorted(families[name].items()))
-        errors = [e.error.mse for e in of_size.values()]
-        draw_line(axes, [*of_size], errors, label=plain(name), **style)
-    pca = {e.latent: e.error.pca_mse.value for e in encoders.values()}
-    lost = np.array([pca[size] for size in sizes], float)
-    axes.plot(sizes, lost, marker="o", ms=2.5, label="PCA", **reference())
-    axes.set(xlabel="latent size l", ylabel="mean squared error", yscale="log", xticks=sizes)
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_title(f"{task}: error on held-out episodes")
-    below(figure, [axes])
+    picture = axes.imshow(values[shown], cmap="cividis", vmin=0, vmax=1, aspect="auto")
+    for (row, each), value in np.ndenumerate(values[shown]):
+        colour = "black" if value > 0.6 or np.isnan(value) else "white"
+        text = r2_text(None if np.isnan(value) else value)
+        axes.text(each, row, text, ha="center", va="center", color=colour, size=5)
+    names = [plain(name) for (name,) in targets]
+    axes.set_yticks(range(len(shown)), [names[i] for i in shown])
+    axes.set_xticks(range(len(columns)), [plain(n) for (n,) in columns], rotation=60, ha="right")
+    axes.grid(visible=False)
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0)
+    figure.suptitle(fill(plain(title), int(width / _CHARACTER)), x=0.01, ha="left", size=7.5)
+    figure.colorbar(picture, label="R²")
     return figure
-
-
-def _families(encoders: _Encoders) -> dict[str, dict[int, _Decoding]]:
-    """Encoders that differ in latent size only, by that size; PCA is the reference, drawn apart."""
-    families: dict[str, dict[int, _Decoding]] = {}
-    sizes = _sizes(encoders)
-    for label, e in encoders.items():
-        name = family(label, e.latent)
-        if name != "pca" and e.latent in sizes:
-            families.setdefault(name, {})[e.latent] = e
-    return families

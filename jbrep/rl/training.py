@@ -1,0 +1,461 @@
+"""One run in its folder: trained by stable-baselines3, from its start or from its checkpoint."""
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from statistics import fmean
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
+from torch.utils.tensorboard import SummaryWriter
+
+from jbrep.encoders import Encoder, save
+from jbrep.encoders.base import BaseEncoder
+from jbrep.envs.infos import by_name
+from jbrep.envs.lanes import EnvironmentFailedError, Lanes, NonFiniteActionError, lanes_at_once
+from jbrep.envs.names import environment_versions
+from jbrep.errors import InputError
+from jbrep.machine import cpu
+from jbrep.records.commit import commits
+from jbrep.records.lock import exclusive
+from jbrep.records.storage import exists, make_folder, read_file, write_whole
+from jbrep.records.tables import write_csv, write_rows
+from jbrep.rl.agent import (
+    Evaluator,
+    acting,
+    action_repeat,
+    make_agent,
+    make_env,
+    restore_statistics,
+    statistics_of,
+    training_seed,
+    unchecked_distributions,
+)
+from jbrep.rl.checkpoint import (
+    Checkpoint,
+    Saver,
+    Standing,
+    draw_noise,
+    restore_draws,
+    standing,
+    vec_env,
+)
+from jbrep.rl.files import (
+    BEGINNING,
+    CHECKPOINT,
+    ENCODER,
+    EPISODES,
+    EVALUATIONS,
+    FAILED,
+    FINISHED,
+    INFOS,
+    OWN,
+    POLICY,
+    POLICY_ZIP,
+    RUN,
+    Episode,
+    Evaluation,
+    Info,
+    RunRecord,
+    read_run,
+)
+from jbrep.rl.history import History
+from jbrep.rl.policy_file import read
+from jbrep.rl.policy_zip import policy_zip
+from jbrep.rl.run import Run
+from jbrep.rl.run_settings import RunSettings
+from jbrep.rl.settings import MAX_LINE
+from jbrep.rl.trained import Trained, fill_whole, pack_whole
+from jbrep.text import printable
+from jbrep.training.trainer import single_thread
+
+_PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
+
+
+class DivergedError(ArithmeticError):
+    """A loss or a weight of the policy is NaN or infinite: training can't continue."""
+
+
+class StoppedError(Exception):
+    """A run stopped on request after so many steps, its checkpoint written; `train` resumes it."""
+
+    def __init__(self, step: int):
+        super().__init__(f"stopped after {step:,} steps")
+        self.step = step
+
+
+class Session(NamedTuple):
+    """What goes on around training.
+
+    Attributes:
+        watch: called with what a run has recorded and its steps so far.
+        save_every: seconds between checkpoints, at least.
+        stop: asked before each rollout; once it is true, a checkpoint is written and training ends.
+        writers: of stable-baselines3's logger, that get what TensorBoard gets.
+        keep_checkpoint: whether a run that has ended keeps a checkpoint, from which it can go on.
+        threads: that step environments.
+        retries: how often in a row an environment that fails is made anew.
+    """
+
+    watch: Callable[[History, int], None] = lambda history, step: None
+    save_every: float = 60
+    stop: Callable[[], bool] = lambda: False
+    writers: Sequence[KVWriter] = ()
+    keep_checkpoint: bool = False
+    threads: int = 1
+    retries: int = 0
+
+
+_ALONE = Session()
+
+
+def train(run: Run, folder: Path, session: Session = _ALONE) -> RunRecord:
+    """Train an agent and write its folder, unless the run has ended already.
+
+    A run that was killed or stopped resumes from its checkpoint, to the same bits.
+
+    Args:
+        run: what to train.
+        folder: for this run alone.
+        session: what goes on around training.
+
+    Returns:
+        The contents of run.json; where a run that went on with more steps failed, why: its files
+        are those of the steps before.
+
+    Raises:
+        StoppedError: the session's `stop` was true.
+    """
+    encoder = run.find_encoder()
+    if ended := standing_of(run, folder, encoder).ended:
+        return ended
+    make_folder(folder, OWN)
+    with exclusive(folder), single_thread():
+        now = standing_of(run, folder, encoder)  # another process may have trained it meanwhile
+        if now.ended:
+            return now.ended
+        record = _train(_Job(run, folder, session, encoder, now.settings), now.resumes)
+        is_over = not session.keep_checkpoint or record.status == FAILED
+        if is_over and read_run(folder) == record:  # else that of fewer steps has its checkpoint
+            drop_checkpoint(folder)
+        return record
+
+
+def standing_of(run: Run, folder: Path, encoder: BaseEncoder | None = None) -> Standing:
+    """How far a run has come in a folder; see `standing`."""
+    settings = run.settings(encoder or run.find_encoder())
+    return standing(folder, settings, versions_of(run), is_open=not run.evaluate_every)
+
+
+def drop_checkpoint(folder: Path) -> None:
+    """Remove the checkpoint of a run that has ended, and not gone on since."""
+    (folder / CHECKPOINT).unlink(missing_ok=True)
+
+
+def versions_of(run: Run) -> dict[str, str]:
+    """The versions of packages that, with the settings, decide every number of a run."""
+    return environment_versions(run.task) | packages()
+
+
+def packages() -> dict[str, str]:
+    """The versions of what every run is made with."""
+    return {name: version(name) for name in _PACKAGES}
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A run that is trained now, in its folder."""
+
+    run: Run
+    folder: Path
+    session: Session
+    encoder: BaseEncoder
+    settings: RunSettings
+
+
+def _train(job: _Job, resumes: bool) -> RunRecord:
+    """Bring a run to its end, from its checkpoint or from its start."""
+    checkpoint = Checkpoint.read(job.folder) if resumes else None
+    history = checkpoint.header.history if checkpoint else History()
+    if isinstance(job.encoder, Encoder):
+        save(job.encoder, job.folder / ENCODER)
+    with _agent(job) as agent:
+        if job.settings.begin_from:
+            _begin(agent, job, is_new=not resumes)
+        scalars = Scalars(job.folder / "tensorboard", history.first_step)
+        agent.set_logger(_Logger(job.settings, [scalars, *job.session.writers]))
+        with closing(_Progress(job, history, checkpoint)) as progress:
+            failed = _learn(agent, job.settings.agent_steps, progress)
+        return _end(agent, job, history, failed)
+
+
+@contextmanager
+def _agent(job: _Job) -> Iterator[BaseAlgorithm]:
+    """The untrained agent, in its environments."""
+    settings, seed = job.settings, training_seed(job.run.seed)
+    chosen = settings.hyperparameters
+    made = make_env(
+        job.run.task,
+        chosen.num_envs,
+        seed,
+        job.encoder,
+        normalize=chosen.normalize,
+        num_threads=min(job.session.threads, chosen.num_envs),
+        action_repeat=chosen.action_repeat,
+        retries=job.session.retries,
+    )
+    steps, device = settings.episode_steps, settings.device
+    with closing(made) as env:
+        agent = make_agent(settings.algorithm, chosen, env, settings.seed, steps, device)
+        env.seed(seed)  # stable-baselines3 has given it the agent's
+        yield agent
+
+
+def _begin(agent: BaseAlgorithm, job: _Job, is_new: bool) -> None:
+    """Give an agent the policy of the run that it begins from, of which its folder has a copy."""
+    path, sha256 = job.folder / BEGINNING, job.settings.begin_from
+    assert sha256 is not None
+    if is_new:
+        source = read(Path(job.run.begin_from) / POLICY, sha256).path
+        write_whole(path, read_file(source))
+    policy = read(path, sha256)
+    fill_whole(policy, agent.policy)
+    restore_statistics(agent, policy.tensors, path)
+
+
+def _learn(agent: BaseAlgorithm, steps: int, progress: BaseCallback) -> Exception | None:
+    """Train up to that step; why training failed, if it did."""
+    try:
+        with unchecked_distributions():
+            agent.learn(steps, callback=progress)
+    except (DivergedError, EnvironmentFailedError) as error:
+        return error
+    except NonFiniteActionError:
+        return DivergedError("the policy's actions are not finite")
+    finally:
+        agent.logger.close()
+    return None
+
+
+class _Progress(BaseCallback):
+    """Records an agent's training, evaluates its policy, and keeps its checkpoint.
+
+    The policy is evaluated before the first step, after the last, and at intervals in between.
+    Checkpoints are written between rollouts, where an agent's state is complete.
+
+    Args:
+        job: what is trained.
+        history: to record in.
+        checkpoint: to go on from, if there is one.
+
+    Raises:
+        StoppedError: (in training) the session is to stop; the checkpoint is written.
+    """
+
+    def __init__(self, job: _Job, history: History, checkpoint: Checkpoint | None):
+        super().__init__()
+        self._job, self._history, self._settings = job, history, job.settings
+        self._checkpoint, self._draws = checkpoint, dict[str, Any]()
+        self._saver = Saver(job.folder, job.settings, versions_of(job.run), job.session.save_every)
+        self._evaluator: Evaluator | None = None
+
+    def close(self) -> None:
+        """Free what the evaluations hold."""
+        if self._evaluator:
+            self._evaluator.close()
+
+    def _on_training_start(self) -> None:
+        run, session = self._job.run, self._job.session
+        episodes = run.evaluation_episodes
+        if run.one_robot:
+            lanes: Lanes = vec_env(self.model).lanes
+        else:
+            threads = min(session.threads, episodes)
+            lanes = lanes_at_once(run.task, episodes, threads, session.retries)
+        self._evaluator = Evaluator(lanes, self._job.encoder, episodes)
+        if self._checkpoint:
+            self._draws = dict(self._checkpoint.tensors)
+            self._checkpoint.restore(self.model)
+            self._checkpoint = None  # a replay buffer can be large
+
+    def _on_rollout_start(self) -> None:
+        check_finite(self.model)
+        if not self._history.evaluations:
+            self._evaluate(self.model._last_obs)
+        self._tell()
+        if self._draws:  # state-dependent noise has just been drawn, for the second time
+            restore_draws(self.model, self._draws)
+            self._draws.clear()
+        is_stopping = self._job.session.stop()
+        if is_stopping or self._saver.is_due:
+            self._saver.write(self.model, self._history)
+        if is_stopping:
+            raise StoppedError(self._step)
+
+    def _on_step(self) -> bool:
+        ended = np.flatnonzero(self.locals["dones"]).tolist()
+        for lane in ended:
+            info = self.locals["infos"][lane]
+            total, length = float(info["episode"]["r"]), info["control_steps"]
+            row = Episode(self._step, lane, total, length, info.get("non_finite", False))
+            self._history.episodes.append(row)
+        if self._is_evaluation_due(bool(ended)):
+            self._evaluate(self.locals["new_obs"])
+        return True
+
+    def _is_evaluation_due(self, has_ended: bool) -> bool:
+        """Whether to evaluate now; with one robot, once an episode of training has ended."""
+        step, keeps = self._step, self._job.session.keep_checkpoint
+        if not self._job.run.one_robot:
+            return self._settings.is_evaluation_due(step, keeps)
+        every, last = self._settings.evaluate_every, self._history.evaluations[-1].step
+        is_final = step >= self._settings.steps and not keeps
+        return has_ended and not is_final and step // every > last // every
+
+    def _evaluate(self, observed: Any) -> None:
+        """Evaluate, with one robot between episodes: the next one begins once more.
+
+        Args:
+            observed: its first observation as the agent is to see it, (1, l).
+        """
+        self._play()
+        if self._job.run.one_robot:
+            first: Any = vec_env(self.model).restart()
+            if normalizer := self.model.get_vec_normalize_env():
+                normalizer.old_obs = first
+                if observed is self.model._last_obs:  # else the transition isn't stored yet
+                    vars(self.model)["_last_original_obs"] = first.copy()
+                first = normalizer.normalize_obs(first)
+            observed[:] = first
+
+    def _play(self, episodes: int | None = None) -> None:
+        """Play the deterministic policy, and record and log the returns and infos."""
+        assert self._evaluator is not None
+        outcome, logger = self._evaluator.outcome(self.model, episodes), self.model.logger
+        self._history.add(self._step, outcome)
+        logger.record("evaluation/mean_return", self._history.means[-1])
+        for name, values in by_name(outcome.numbers).items():
+            logger.record(f"evaluation/{name}", fmean(values))
+        logger.dump(self.model.num_timesteps)
+
+    def _on_training_end(self) -> None:
+        check_finite(self.model)
+        self._tell()  # the last evaluation can take minutes
+        if self._job.session.keep_checkpoint:
+            if not self._draws:  # else nothing was trained since, and it is drawn
+                draw_noise(self.model)
+            self._saver.write(self.model, self._history)
+        self._history.drop_from(self._settings.steps)  # an evaluation of a run that is kept
+        self._play(self._settings.final_episodes)
+        self._tell()
+
+    def _tell(self) -> None:
+        self._job.session.watch(self._history, self._step)
+
+    @property
+    def _step(self) -> int:
+        """Training steps so far, in control steps."""
+        return self._settings.control_steps(self.model.num_timesteps)
+
+
+def check_finite(agent: BaseAlgorithm) -> None:
+    """Check the last losses and the policy's weights.
+
+    Raises:
+        DivergedError: one is NaN or infinite.
+    """
+    for name, value in agent.logger.name_to_value.items():
+        if name.endswith("loss") and not np.isfinite(value):
+            raise DivergedError(f"{name} is {value}")
+    if not all(bool(torch.isfinite(p.sum())) for p in acting(agent.policy).parameters()):
+        raise DivergedError("the policy's weights are not finite")
+
+
+def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | None) -> RunRecord:
+    """Write the run's files; the policy of a run that failed isn't kept.
+
+    Where a run went on after fewer steps and failed, what it had left by then stays.
+    """
+    folder, settings = job.folder, job.settings
+    keeps = failed is not None and exists(folder / RUN)
+    goes_on = job.session.keep_checkpoint and exists(folder / CHECKPOINT) and not keeps
+    if isinstance(failed, EnvironmentFailedError) and goes_on:
+        raise InputError(
+            f"{failed}; the run in {folder} has a checkpoint: the same command goes on from it if "
+            "the environment is reproducible, and its policy can be played and exported"
+        ) from failed
+    policy, tables = b"", dict[str, str]()
+    if not failed:
+        trained = Trained(
+            agent.policy,
+            job.run.task,
+            job.encoder,
+            settings,
+            statistics=statistics_of(agent),
+            action_repeat=action_repeat(agent),
+        )
+        policy = pack_whole(trained)
+    if keeps:
+        tables |= read_run(folder).tables
+    else:
+        (folder / RUN).unlink(missing_ok=True)  # of fewer steps, before its files change
+        tables |= _write_tables(folder, history)
+        if policy:
+            write_whole(folder / POLICY, policy)
+            write_whole(folder / POLICY_ZIP, policy_zip(agent, settings))
+    steps = settings.control_steps(agent.num_timesteps)
+    record = RunRecord(
+        status=FAILED if failed else FINISHED,
+        reason=f"{printable(str(failed))[: MAX_LINE // 2]} after {steps:,} steps"
+        if failed
+        else None,
+        settings=settings,
+        latent_size=job.encoder.latent_size,
+        steps=steps,
+        seconds=history.seconds,
+        versions=versions_of(job.run),
+        commits=commits(),
+        cpu=cpu(),
+        tables=tables,
+        policy_sha256=hashlib.sha256(policy).hexdigest() if policy else None,
+    )
+    if not keeps:
+        record.write(folder / RUN)  # last: the run has ended where it exists
+    return record
+
+
+def _write_tables(folder: Path, history: History) -> dict[str, str]:
+    """Write the run's tables; their SHA-256 by their names."""
+    tables = {
+        EPISODES: write_rows(folder / EPISODES, history.episodes, Episode),
+        EVALUATIONS: write_rows(folder / EVALUATIONS, history.evaluations, Evaluation),
+    }
+    if history.infos:
+        tables[INFOS] = write_csv(folder / INFOS, Info._fields, history.infos)
+    return tables
+
+
+class _Logger(Logger):
+    """stable-baselines3's, that tells writers control steps instead of its agent's."""
+
+    def __init__(self, settings: RunSettings, writers: list[KVWriter]):
+        super().__init__(None, writers)
+        self._settings = settings
+
+    def dump(self, step: int = 0) -> None:
+        super().dump(self._settings.control_steps(step))
+
+
+class Scalars(TensorBoardOutputFormat):
+    """TensorBoard's file after a step; later ones of an earlier process are hidden."""
+
+    def __init__(self, folder: Path, step: int):
+        self.writer = SummaryWriter(str(folder), purge_step=step + 1)
+        self._is_closed = False
