@@ -32,6 +32,7 @@ def repair(
         make: makes the policy from what the manifest says of it.
     """
     check_counts(lanes, num_threads)
+    read_manifest(folder)  # so that nothing is locked that isn't a data set
     with exclusive(folder):
         manifest = read_manifest(folder)
         settings = manifest.settings

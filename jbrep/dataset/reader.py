@@ -1,6 +1,7 @@
 """Reading a data set."""
 
 import hashlib
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -258,27 +259,36 @@ class Dataset:
             values = [number(each[name], ".4g") for name in _RANGES[2:6]]
             rows.append((each["feature"], each["unit"], *values, usual))
         sizes = counted(self.task.size, "feature"), counted(self.task.action_size, "action")
-        about["environment"] = ", ".join([self.task.id, *sizes, *self.task.given_arguments])
-        about["policy"] = policy_text(about["policy"])
-        del about["folder"], about["shard_episodes"]
-        named = {name.replace("_", " "): _text(value) for name, value in about.items()}
-        return named, Table("", _RANGES, rows)
+        episodes, length, returns = f"{about['episodes']:,}", about["length"], about["return"]
+        if length:
+            low, high = (f"{length[end]:,.0f}" for end in ("min", "max"))
+            episodes += f" of {low} steps" if low == high else f" of {low} to {high} steps"
+        if ended := about["terminated"]:
+            episodes += f", {ended:,} terminated by a state"
+        unfinished = "" if about["complete"] else f" of {about['steps']:,} that were asked for"
+        named = {
+            "task": ", ".join([self.task.name, *sizes, *self.task.given_arguments]),
+            "policy": policy_text(about["policy"]),
+            "seed": "-" if self.manifest.settings.is_imported else str(about["seed"]),
+            "rows": f"{about['rows']:,}{unfinished}",
+            "episodes": episodes,
+            "return": _spread_text(returns) if returns else "not known",
+            "columns": ", ".join(about["columns"]),
+            "files": f"{counted(about['shards'], 'shard')}, {about['bytes'] / 1e6:,.1f} MB",
+            "made with": ", ".join(f"{name} {what}" for name, what in about["versions"].items()),
+            "fingerprint": about["fingerprint"],
+        }
+        further = {name: about[name] for name in ("reward", "note") if about.get(name)}
+        return named | further, Table("", _RANGES, rows)
 
 
-def _text(value: Any) -> str:
-    """A value of `Dataset.describe` for people."""
-    match value:
-        case bool():
-            return "yes" if value else "no"
-        case int():
-            return f"{value:,}"
-        case float():
-            return f"{value:,.6g}"
-        case list():
-            return ", ".join(value)
-        case dict():
-            return ", ".join(f"{name} {_text(each)}" for name, each in value.items()) or "-"
-    return str(value)
+def _spread_text(values: Mapping[str, float]) -> str:
+    """What `_spread` found, in a line."""
+    shown = {name: number(value, ",.1f") for name, value in values.items()}
+    return (
+        f"median {shown['median']} [10 % {shown['p10']}, 90 % {shown['p90']}], mean "
+        f"{shown['mean']}, from {shown['min']} to {shown['max']}"
+    )
 
 
 def _spread(values: Any) -> dict[str, float]:

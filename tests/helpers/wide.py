@@ -45,7 +45,7 @@ class WideDataset:
         self.episodes = {"length": np.array(lengths), "seed": np.arange(len(lengths))}
         self.folder = folder
         settings = SimpleNamespace(policy={"kind": "uniform"}, seed=0, unrewarded=False)
-        self.manifest = SimpleNamespace(fingerprint="wide", settings=settings)
+        self.manifest, self.fingerprint = SimpleNamespace(settings=settings), "wide"
         random = np.random.default_rng(0)
         self.arrays = {
             "observation": self._observations(sum(lengths), features, random),
