@@ -270,16 +270,16 @@ def test_what_fails_is_closed_kept_and_tried_again(tmp_path):
     (tmp_path / "log").unlink()
     robot = arm(tmp_path, fails=[probe + 2 * STEPS + 7])
     command = ("collect", *robot, "--steps", 100, "--threads", 1, "--out", tmp_path / "d")
-    told = jbrep(*command, "--shard-episodes", 50)
+    told = jbrep(*command, "--shard-episodes", 2)
     assert told.exit_code == 2
     assert "OSError: no answer; 2 episodes of 50 rows are kept" in told.output
     assert events(tmp_path) == "ofc"
     assert not list(find_problems(tmp_path / "d"))
     assert len(Dataset(tmp_path / "d")) == 50
-    told = jbrep(*command, "--shard-episodes", 50)  # the port has no such step any more
+    told = jbrep(*command, "--shard-episodes", 2)  # the port has no such step any more
     assert told.exit_code == 0, told.output
     Arm.steps_of_all = 0
-    peace = (*command[:-1], tmp_path / "e", "--shard-episodes", 50, "--retries", 1)
+    peace = (*command[:-1], tmp_path / "e", "--shard-episodes", 2, "--retries", 1)
     told = jbrep(*peace)
     assert told.exit_code == 0, told.output
     assert "no answer; retrying" in told.stderr
