@@ -39,7 +39,7 @@ def test_states_become_encoders_and_diagnostics(peace):
     told = jbrep("evaluate", "--encoder", *paths, "--data", data, "--out", folder / "judged")
     for label in ("full", "dae-4", "pca-4", "judged/evaluation.json", "figures. --all shows"):
         assert label in told.output
-    assert (folder / "judged" / "error_by_latent.png").exists()
+    assert (folder / "judged" / "error_by_feature.png").exists()
     judged = json.loads((folder / "judged" / "evaluation.json").read_text())
     assert judged["data"]["fingerprint"] == Dataset(data).fingerprint
     for encoder in map(load, paths):
@@ -53,10 +53,9 @@ def test_states_become_encoders_and_diagnostics(peace):
 def test_a_studys_tables_are_those_of_its_runs(peace):
     folder = peace[0] / "study"
     rows = list(csv.reader((folder / "returns.csv").read_text().splitlines()))[1:]
-    statistics = json.loads((folder / "statistics.json").read_text())
-    (group,) = statistics["groups"]
-    assert [label["representation"] for label in group["labels"]] == list(SEEN)
-    for label in group["labels"]:
+    (group,) = json.loads((folder / "findings.json").read_text())["groups"]
+    assert [agents["representation"] for agents in group["agents"]] == list(SEEN)
+    for label in group["agents"]:
         name = label["representation"]
         for seed, final in zip((0, 1), label["by_run"]["final_return"], strict=True):
             run = folder / "runs" / "face_direction" / "a2c" / name / f"seed-{seed}"
@@ -80,27 +79,24 @@ def test_a_studys_tables_are_those_of_its_runs(peace):
 
 def test_a_report_says_what_the_tables_say(peace):
     folder, said = peace[0] / "study", peace[1]["report"]
-    statistics = json.loads((folder / "statistics.json").read_text())
-    summary = json.loads((folder / "summary.json").read_text())
+    found = json.loads((folder / "findings.json").read_text())
     page = (folder / "report.html").read_text()
-    (group,) = statistics["groups"]
-    assert summary["verdicts"] == group["verdicts"] == []  # nothing was claimed
+    (group,) = found["groups"]
+    assert found["verdicts"] == []  # nothing was claimed
     (comparison,) = group["comparisons"]
-    full, dae = (np.array(label["by_run"]["final_return"]) for label in group["labels"])
+    full, dae = (np.array(label["by_run"]["final_return"]) for label in group["agents"])
     difference = comparison["numbers"]["final_return_difference"][0]
     assert (comparison["representation"], comparison["shared"]) == ("dae-4", 2)
     assert difference == pytest.approx((dae - full).mean())
-    for label in group["labels"]:
-        name = f"face_direction/a2c/{label['representation']}"
-        assert summary["numbers"][name] == label["numbers"]
-        assert name in page
-    assert (summary["runs"], summary["missing"], summary["failed"]) == (4, [], [])
-    assert f"{folder / 'report.html'}\nBeside it: summary.json, summary.md" in said
+    for run in found["runs"]:
+        assert run["label"] in page
+    assert (len(found["runs"]), found["missing"]) == (4, {})
+    assert f"{folder / 'report.html'}\nBeside it: findings.json, summary.md" in said
     drawn = {path.stem for path in (folder / "figures").iterdir()}
     for name in drawn:
         for suffix in ("pdf", "png", "csv"):
             assert (folder / "figures" / f"{name}.{suffix}").stat().st_size > 0
-    assert {"representations", "final_return", "every_run", "autoencoders"} <= drawn
+    assert {"representations", "final_return", "every_run"} <= drawn
 
 
 def test_a_recording_shows_the_agent_that_was_evaluated(peace, tmp_path):

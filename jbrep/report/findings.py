@@ -1,6 +1,5 @@
 """What a study found and how it ran: findings.json, from which every output is made."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any, ClassVar
@@ -177,7 +176,6 @@ class Findings(Document, frozen=True, kw_only=True):
 
     format: ClassVar[str] = "jbrep findings"
     format_version: ClassVar[int] = 1
-    max_bytes: ClassVar[int] = 1 << 28
     indent: ClassVar[int] = 1
 
     name: str
@@ -257,9 +255,6 @@ class Findings(Document, frozen=True, kw_only=True):
         """On the claims of one task and algorithm."""
         key = group.task, group.algorithm
         return [each for each in self.verdicts if (each.task, each.algorithm) == key]
-
-    def text(self) -> str:
-        return json.dumps(self.as_json(), indent=self.indent, allow_nan=False) + "\n"
 
 
 def groups_of(
