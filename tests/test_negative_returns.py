@@ -11,7 +11,6 @@ from jbrep.errors import InputError
 from jbrep.records.tables import write_csv
 from jbrep.report import write_report
 from jbrep.report.figures import study_plots, write
-from jbrep.report.figures.panels import fitting
 from jbrep.report.findings import Findings
 from jbrep.report.report import results_text
 from jbrep.report.tables import read_tables
@@ -228,12 +227,6 @@ def test_nothing_is_drawn_of_what_is_unknown(plots):
     for plot in plots.values():
         labels = {line.get_label() for axes in drawn(plot).axes for line in axes.lines}
         assert not labels & {"solved", "hand-written"}
-
-
-def test_a_line_is_in_sight_where_returns_come_near_it():
-    returns = [-400.0, -100.0, np.nan]
-    assert fitting(returns, near=[0])[1] > 0
-    assert fitting(returns, near=[500.01]) == fitting(returns)
 
 
 # the report
