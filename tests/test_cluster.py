@@ -50,9 +50,9 @@ def test_runs_whose_workers_are_killed_say_so(tmp_path, monkeypatch):
     def get(reference):
         raise ray.exceptions.WorkerCrashedError
 
-    never = SimpleNamespace(remote=lambda *arguments: "a reference")
+    never = SimpleNamespace(remote=lambda *arguments: object())
     monkeypatch.setattr(runner, "on_cluster", lambda *arguments, **resources: never)
-    monkeypatch.setattr(ray, "wait", lambda references: (references, []))
+    monkeypatch.setattr(ray, "wait", lambda references: (references[:1], references[1:]))
     monkeypatch.setattr(ray, "get", get)
     plan = Plan(STUDY, tmp_path)
     ended = list(runner.on_ray(plan, plan.cells, 1))

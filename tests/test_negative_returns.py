@@ -11,7 +11,6 @@ from jbrep.errors import InputError
 from jbrep.records.tables import write_csv
 from jbrep.report import write_report
 from jbrep.report.figures import study_plots, write
-from jbrep.report.figures.panels import fitting
 from jbrep.report.findings import Findings
 from jbrep.report.report import results_text
 from jbrep.report.tables import read_tables
@@ -65,7 +64,8 @@ def study(levels=LEVELS):
         for seed, apart in enumerate(np.linspace(-1.6, 1.6, SEEDS)):
             changes = {"failed_at": 9000} if (name, seed) == ("dae-1", 5) else {}
             if (name, seed) == ("pca-1", 0):
-                changes = {"steps": [], "returns": [], "failed_at": 0}
+                nothing = {"steps": np.zeros(0, np.int64), "returns": np.ones((0, 1))}
+                changes = {**nothing, "failed_at": 0}
             yield make(name, seed, level + spread * apart, speed, **changes)
 
 
@@ -228,12 +228,6 @@ def test_nothing_is_drawn_of_what_is_unknown(plots):
     for plot in plots.values():
         labels = {line.get_label() for axes in drawn(plot).axes for line in axes.lines}
         assert not labels & {"solved", "hand-written"}
-
-
-def test_a_line_is_in_sight_where_returns_come_near_it():
-    returns = [-400.0, -100.0, np.nan]
-    assert fitting(returns, near=[0])[1] > 0
-    assert fitting(returns, near=[500.01]) == fitting(returns)
 
 
 # the report

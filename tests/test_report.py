@@ -3,7 +3,6 @@
 import csv
 import html
 import json
-import random
 import re
 import shutil
 import subprocess
@@ -555,7 +554,7 @@ def test_references_that_were_changed_are_refused_until_a_study_plays_them_again
     [
         ("runs.json", lambda text: text[:100], "runs.json is damaged, or not a jbrep runs file"),
         ("runs.json", lambda text: text.replace("60.0", "NaN"), "runs.json is damaged"),
-        ("runs.json", lambda text: text.replace('"2.13.0', '"2; touch P #'), "versions"),
+        ("runs.json", lambda text: text.replace('"2.13.0', '"2; touch P #'), r"versions\[0\]"),
         (
             "runs.json",
             lambda text: text.replace('"label": "face_direction', '"label": "turn'),
@@ -585,44 +584,10 @@ def test_damaged_tables_are_refused(name, change, message, whole, tmp_path):
     assert sorted(tmp_path.iterdir()) == before
 
 
-ODD = (None, True, -1, 0.5, 10**30, "", "x", [], {}, [None], {"x": None})
-
-
-def change_one(value, choose):
-    """A copy of a JSON value with one part, anywhere, replaced or removed."""
-    if isinstance(value, dict | list) and value and choose.random() < 0.85:
-        key = choose.choice(list(value) if isinstance(value, dict) else range(len(value)))
-        changed = value.copy()
-        if choose.random() < 0.1:
-            del changed[key]
-        else:
-            changed[key] = change_one(value[key], choose)
-        return changed
-    return choose.choice(ODD)
-
-
-def test_changed_tables_are_refused_or_shown(whole, tmp_path, monkeypatch):
-    """Whatever is read can be put into words; figures are left out here, as they take long."""
-    copy_tables(whole, tmp_path)
-    monkeypatch.setattr(report, "study_plots", lambda found: [])
-    record = json.loads((whole / "runs.json").read_text())
-    choose, refused = random.Random(0), []
-    for _ in range(150):
-        changed = change_one(record, choose)
-        with suppress(AttributeError):
-            forge(tmp_path / "runs.json", changed)
-        try:
-            write_report(found_in(tmp_path), tmp_path)
-        except InputError as error:
-            refused.append(str(error))
-    assert 50 < len(refused) < 150
-    assert not any("\n" in message for message in refused)
-
-
-def test_a_run_of_a_newer_jbrep_is_named(tmp_path):
+def test_a_run_of_another_version_is_named(tmp_path):
     plan = make_study(tmp_path / "new", left=11)
     path = plan.folder_of(plan.cells[0]) / "run.json"
-    path.write_text(path.read_text().replace('version": 7', 'version": 99'))
+    path.write_text(re.sub(r'version": \d+', 'version": 99', path.read_text(), count=1))
     with pytest.raises(InputError, match=r"run\.json has version 99 of the jbrep run format"):
         write_tables(plan.folder)
 

@@ -272,14 +272,17 @@ class Dataset:
             "seed": "-" if self.manifest.settings.is_imported else str(about["seed"]),
             "rows": f"{about['rows']:,}{unfinished}",
             "episodes": episodes,
-            "return": _spread_text(returns) if returns else "not known",
+            "return": _spread_text(returns) if returns else "not known: the data have no rewards",
             "columns": ", ".join(about["columns"]),
             "files": f"{counted(about['shards'], 'shard')}, {about['bytes'] / 1e6:,.1f} MB",
             "made with": ", ".join(f"{name} {what}" for name, what in about["versions"].items()),
             "fingerprint": about["fingerprint"],
         }
-        further = {name: about[name] for name in ("reward", "note") if about.get(name)}
-        return named | further, Table("", _RANGES, rows)
+        if code := self.manifest.settings.reward:
+            named["reward"] = f"by {code}"
+        if note := about.get("note"):
+            named["note"] = note
+        return named, Table("", _RANGES, rows)
 
 
 def _spread_text(values: Mapping[str, float]) -> str:
