@@ -71,7 +71,7 @@ def test_it_is_the_fewest_whole_episodes_with_enough_rows(sledges):
     assert not list(find_problems(sledges))
     assert not list(replay_problems(dataset, count))
     told = jbrep("data", "info", sledges).output
-    assert ["terminated", f"{episodes['terminated'].sum()}"] in map(str.split, told.splitlines())
+    assert f"{episodes['terminated'].sum()} terminated by a state" in told
     assert f"{ID}, 2 features, 3 actions" in told
 
 
@@ -327,7 +327,7 @@ def test_a_data_set_whose_package_isn_t_imported(sledges, tmp_path, monkeypatch)
     ):
         told = jbrep("data", *command)
         assert (told.exit_code, told.output.count("\n")) == (2, 1)
-        assert "it was made by environments; add --import environments" in told.output
+        assert "add --import environments" in told.output
     assert jbrep("data", "derive", sledges, "--history", 2, *out).exit_code == 0
     source, derived = Dataset(sledges), Dataset(tmp_path / "x")
     assert derived.manifest.versions == source.manifest.versions

@@ -216,7 +216,7 @@ def test_what_it_cannot_act_on_is_refused():
     ):
         controller(np.full(TASK.size, 1e38))
     assert controller(np.zeros(TASK.size)).shape == (TASK.action_size,)  # there is none to hold
-    run = Run.of(TASK, "sac", overrides={"use_sde": True}, trainer="sb3")
+    run = Run.of(TASK, "sac", overrides={"use_sde": True})
     encoder = find("full", TASK)
     trained = build(run.settings(encoder), encoder, Path("here"))
     with pytest.raises(InputError, match="use_sde"):

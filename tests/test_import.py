@@ -659,7 +659,7 @@ from pathlib import Path
 from jbrep.dataset.formats import open_source, writer
 def die(*arguments):
     os.kill(os.getpid(), 9)
-writer.publish_folder = die
+writer.publish = die
 writer.write(open_source(sys.argv[1]), Path(sys.argv[2]))
 """
 

@@ -56,7 +56,7 @@ class Cart:
         self.task = task.replace(action_low=(-1.0,), action_high=(1.0,))
         self.episodes = {"length": np.full(EPISODES, STEPS), "seed": np.arange(EPISODES)}
         policy = SimpleNamespace(policy={"kind": "uniform"}, seed=0, unrewarded=False)
-        self.manifest = SimpleNamespace(fingerprint="cart", settings=policy)
+        self.manifest, self.fingerprint = SimpleNamespace(settings=policy), "cart"
         random = np.random.default_rng(0)
         actions = random.uniform(-1, 1, (EPISODES, STEPS, 1)).astype(np.float32)
         seen, reward = self.play(lambda step, seen: actions[:, step, 0], random)

@@ -42,9 +42,8 @@ class HiddenDataset(WideDataset):
         self.hidden, self.folder, self.task = rows, "made-up", task
         task.__dict__.update(action_low=(-1.0,), action_high=(1.0,))
         self.episodes = {"length": np.full(episodes, length), "seed": np.arange(episodes)}
-        self.manifest = SimpleNamespace(
-            fingerprint="made-up", settings=SimpleNamespace(unrewarded=False)
-        )
+        self.manifest = SimpleNamespace(settings=SimpleNamespace(unrewarded=False))
+        self.fingerprint = "made-up"
         self.arrays = {
             "observation": np.hstack((rows @ [[1, 0.5], [-0.5, 1]], noise)).astype(np.float32),
             "action": actions.T.reshape(count, 1).astype(np.float32),
