@@ -16,11 +16,9 @@ from typing import Any
 
 import h5py
 import numpy as np
-import torch
 from mujoco.batch import Batch
 from rows import make_rows
 from timing import show, timed
-from torch.utils.data import DataLoader, TensorDataset
 
 from jbrep import jitterbug
 from jbrep.collect import collect
@@ -178,18 +176,6 @@ def compare_readers(folder: Path) -> None:
         later.append(plain_pass(plain) / our_pass(opened))
     show("first sequential pass, which checks / np.memmap", first)
     show("sequential pass / np.memmap", later, ">= 0.9")
-
-    tensors = TensorDataset(torch.from_numpy(np.asarray(data["observation"])))
-    loader = DataLoader(tensors, batch_size=BATCH, shuffle=True)
-
-    def shuffled() -> None:
-        order, column = random.permutation(ROWS), data["observation"]
-        for start in range(0, ROWS, BATCH):
-            column[order[start : start + BATCH]]
-
-    shuffled()  # the first pass checks
-    ratios = [timed(lambda: [None for _ in loader]) / timed(shuffled) for _ in range(ROUNDS // 2)]
-    show("shuffled pass / torch DataLoader", ratios, ">= 20")
 
 
 def main() -> None:

@@ -71,7 +71,7 @@ def test_it_is_the_fewest_whole_episodes_with_enough_rows(sledges):
     assert not list(find_problems(sledges))
     assert not list(replay_problems(dataset, count))
     told = jbrep("data", "info", sledges).output
-    assert f"{episodes['terminated'].sum()} terminated by a state" in told
+    assert ["terminated", f"{episodes['terminated'].sum()}"] in map(str.split, told.splitlines())
     assert f"{ID}, 2 features, 3 actions" in told
 
 
@@ -197,7 +197,7 @@ def test_a_shard_that_fails_doesn_t_matter_until_it_is_needed(tmp_path):
     wide = some(task, steps=10**6, shard_episodes=300)
     growth = Growth(tmp_path, new_manifest(wide))
     shards = backends.local(Simulator(wide, Uniform(), 1, 2))(growth, lambda steps: None)
-    seeds = np.concatenate([next(shards)["episodes/seed"] for _ in range(10)])
+    seeds = np.concatenate([next(shards)["episodes/seed"] for _ in range(300)])
     np.testing.assert_array_equal(seeds, wide.seeds(np.arange(300)))
     with pytest.raises(InputError, match="Sledges/Broken-v0 failed at step 4"):
         next(shards)
@@ -214,7 +214,7 @@ def test_a_data_set_of_what_is_not_reproducible_says_so(name, tmp_path):
     assert jbrep("data", "verify", data).exit_code == 0
     told = jbrep("data", "verify", data, "--replay", 1)
     assert (told.exit_code, told.output.count("\n")) == (2, 1)
-    assert f"episodes can't be replayed: {env_id} is not reproducible" in told.output
+    assert f"can't be replayed: {env_id} is not reproducible" in told.output
     assert "note" in jbrep("data", "info", data).output
     (data / "shard-00000.h5").unlink()
     told = jbrep("data", "repair", data)
@@ -232,7 +232,7 @@ def test_arrays_of_states_are_stored_and_compared(tmp_path):
     assert not episodes["initial_heat"].any()
     assert len(np.unique(episodes["colour"][:, 0])) == len(episodes["length"])
     assert not list(replay_problems(dataset, 2))
-    with pytest.raises(InputError, match="only the Jitterbug's tasks share their motion"):
+    with pytest.raises(InputError, match="only the Jitterbug's tasks share"):
         derive(tmp_path / "data", "face_direction", tmp_path / "derived")
     with pytest.raises(InputError, match=f"{ID} has no states to store"):
         some(store_state=True)
@@ -271,9 +271,9 @@ def test_actions_are_stepped_in_the_32_bits_that_are_stored(tmp_path):
 
 
 def test_arguments_are_settings(sledges, tmp_path):
-    with pytest.raises(InputError, match=r"settings: arguments\.wind none \(now: 0.5\)"):
+    with pytest.raises(InputError, match=r"arguments\.wind none \(now: 0.5\)"):
         collect(some(describe(ID, {"wind": 0.5})), sledges)
-    with pytest.raises(InputError, match=r"other settings: max_episode_steps 40 \(now: 9\)"):
+    with pytest.raises(InputError, match=r"max_episode_steps 40 \(now: 9\)"):
         collect(some(describe(ID, max_episode_steps=9)), sledges)
     collect(some(describe(ID, {"wind": 0.5})), tmp_path / "windy", num_threads=1)
     assert (Dataset(tmp_path / "windy")["reward"][:10] != Dataset(sledges)["reward"][:10]).any()

@@ -36,7 +36,7 @@ def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
     collect(DATA, tmp_path / "data-here", num_threads=1)
     assert contents(tmp_path / "data") == contents(tmp_path / "data-here")
     plan = Plan(STUDY, tmp_path / "study-here")
-    assert {outcome.status for outcome in work(plan.assigned(plan.cells))} == {"finished"}
+    assert {work(plan.assigned(cell)).status for cell in plan.cells} == {"finished"}
     pairs = zip(read_runs(tmp_path / "study"), read_runs(plan.folder), strict=True)
     for ours, theirs in pairs:
         assert (ours.label, ours.settings) == (theirs.label, theirs.settings)
@@ -50,11 +50,11 @@ def test_runs_whose_workers_are_killed_say_so(tmp_path, monkeypatch):
     def get(reference):
         raise ray.exceptions.WorkerCrashedError
 
-    never = SimpleNamespace(remote=lambda *arguments: "a reference")
+    never = SimpleNamespace(remote=lambda *arguments: object())
     monkeypatch.setattr(runner, "on_cluster", lambda *arguments, **resources: never)
-    monkeypatch.setattr(ray, "wait", lambda references: (references, []))
+    monkeypatch.setattr(ray, "wait", lambda references: (references[:1], references[1:]))
     monkeypatch.setattr(ray, "get", get)
     plan = Plan(STUDY, tmp_path)
-    ended = list(runner.on_ray(plan, [plan.cells], 1))
+    ended = list(runner.on_ray(plan, plan.cells, 1))
     assert [each.name for each in ended] == [cell.name for cell in plan.cells]
     assert all("its worker was killed 5 times, perhaps" in each.message for each in ended)

@@ -17,7 +17,6 @@ from torch.nn import functional
 from jbrep.dae import DAE
 from jbrep.encoders import ACTIVATIONS, Encoder, Layer, find, load, save
 from jbrep.encoders.card import card
-from jbrep.encoders.imported import convert
 from jbrep.encoders.layers import activate
 from jbrep.encoders.onnx import export
 from jbrep.envs import describe
@@ -307,7 +306,7 @@ def test_a_model_gives_what_onnxruntime_gives(name, tmp_path):
     onnx.save(made, tmp_path / "it.onnx")
     kind = np.float64 if name == "float64" else np.float32
     parts = [played(tmp_path / "it.onnx", part)["y"] for part in np.split(ROWS.astype(kind), 25)]
-    encoder = convert(tmp_path / "it.onnx", TASK, None, "mine")
+    encoder = Encoder.from_onnx(tmp_path / "it.onnx", TASK, None, "mine")
     assert not encoder.can_decode
     np.testing.assert_allclose(encoder(ROWS), np.concatenate(parts), rtol=1e-5, atol=1e-5)
     save(encoder, tmp_path / "it")
@@ -320,7 +319,7 @@ def test_a_decoder_of_its_own(tmp_path):
     onnx.save(model("y = MatMul x w", {"w": f32(16, 3)}), tmp_path / "into.onnx")
     back = model("y = MatMul x w", {"w": f32(3, 16)}, ("x", (1, 3)))
     onnx.save(back, tmp_path / "back.onnx")
-    encoder = convert(tmp_path / "into.onnx", TASK, tmp_path / "back.onnx", "mine")
+    encoder = Encoder.from_onnx(tmp_path / "into.onnx", TASK, tmp_path / "back.onnx", "mine")
     assert encoder.decode(encoder(ROWS)).shape == ROWS.shape
 
 
@@ -340,17 +339,17 @@ def test_a_decoder_of_its_own(tmp_path):
 def test_a_model_that_is_no_encoder_is_refused(made, message, tmp_path):
     (tmp_path / "it.onnx").write_bytes(made.SerializeToString())
     with pytest.raises(InputError, match=message) as refused:
-        convert(tmp_path / "it.onnx", TASK, None, "mine")
+        Encoder.from_onnx(tmp_path / "it.onnx", TASK, None, "mine")
     assert "\n" not in str(refused.value)
 
 
 def test_what_is_no_model_is_refused(tmp_path):
     path = tmp_path / "it.onnx"
     with pytest.raises(InputError, match="no file"):
-        convert(path, TASK, None, "mine")
+        Encoder.from_onnx(path, TASK, None, "mine")
     path.write_text("PK hello")
     with pytest.raises(InputError, match="isn't an ONNX model that can be read"):
-        convert(path, TASK, None, "mine")
+        Encoder.from_onnx(path, TASK, None, "mine")
 
 
 def elsewhere(location, weights):
@@ -370,12 +369,12 @@ def test_weights_are_read_from_beside_the_model_alone(tmp_path):
         path.write_bytes(weights.tobytes())
     (folder / "link").symlink_to(tmp_path / "weights")
     (folder / "it.onnx").write_bytes(elsewhere("weights", weights))
-    made = convert(folder / "it.onnx", TASK, None, "mine")
+    made = Encoder.from_onnx(folder / "it.onnx", TASK, None, "mine")
     np.testing.assert_allclose(made(ROWS), ROWS @ weights, rtol=1e-4, atol=1e-5)
     for location in ("../weights", str(tmp_path / "weights"), "link", "missing"):
         (folder / "it.onnx").write_bytes(elsewhere(location, weights))
         with pytest.raises(InputError, match="isn't an ONNX model that can be read"):
-            convert(folder / "it.onnx", TASK, None, "mine")
+            Encoder.from_onnx(folder / "it.onnx", TASK, None, "mine")
 
 
 def test_an_encoders_file_reads_no_other_file(tmp_path, monkeypatch):
@@ -383,7 +382,7 @@ def test_an_encoders_file_reads_no_other_file(tmp_path, monkeypatch):
     weights = f32(16, 3)
     (tmp_path / "weights").write_bytes(weights.tobytes())
     onnx.save(model("y = MatMul x w", {"w": weights}), tmp_path / "it.onnx")
-    made = convert(tmp_path / "it.onnx", TASK, None, "mine")
+    made = Encoder.from_onnx(tmp_path / "it.onnx", TASK, None, "mine")
     forged = np.frombuffer(elsewhere("weights", weights), np.uint8)
     tensors = made.tensors() | {"encoder.0.onnx": forged}
     monkeypatch.setattr(made, "tensors", lambda: tensors)
@@ -409,4 +408,3 @@ def test_sizes_of_ones_own_are_an_architecture(tmp_path):
     assert made.header.training["architecture"] == "64x32"
     for wrong in ("64,,32", "0", "64,5000"):
         assert "architecture" in mistake(*command, wrong)
-    assert "bytes are more than" in mistake(*command, "2000,2000")

@@ -149,7 +149,7 @@ def test_files_that_can_t_be_read_are_named(copied):
     dataset = Dataset(copied)
     path.unlink()
     path.mkdir()
-    with pytest.raises(InputError, match=r"can't read .*shard-00000\.h5"):
+    with pytest.raises(InputError, match=r"shard-00000\.h5"):
         dataset["reward"][0]
 
 

@@ -15,7 +15,6 @@ from sklearn.preprocessing import StandardScaler
 from wide import make_feature, make_task, wide
 
 from jbrep.dataset import ScaledDataset, Scaler
-from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.encoders.header import EncoderHeader
 from jbrep.encoders.shipped import unlearned
@@ -84,14 +83,6 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
     assert 0.9 <= covered / 300 <= 0.98
 
 
-def test_resamples_are_the_same_for_all_that_is_compared():
-    random = np.random.default_rng(0)
-    one = random.normal(size=(40, 1))
-    ratio = bootstrap(lambda a, b: (a / b)[..., 0], 2 * one**2, one**2)
-    np.testing.assert_allclose(ratio, 2)
-    assert bootstrap(lambda a: a[..., 0], one) == bootstrap(lambda a: a[..., 0], one)
-
-
 def test_one_episode_has_no_interval():
     result = bootstrap(lambda s: s[..., 0], np.ones((1, 1)))
     assert result.value == 1
@@ -146,16 +137,6 @@ def test_all_held_out_rows_are_judged_in_little_memory(tmp_path, monkeypatch):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < len(data.test) * data.task.size * 4
-
-
-def test_a_sample_is_in_order_and_of_any_step(held_out):
-    rows = sample(held_out.data.test, 500)
-    assert len(np.unique(rows)) == 500
-    assert (np.diff(rows) > 0).all()
-    np.testing.assert_array_equal(rows, sample(held_out.data.test, 500))
-    steps = held_out.data.dataset["step"][rows]
-    assert len(np.unique(steps % 10)) == 10
-    np.testing.assert_array_equal(sample(rows, 500), rows)
 
 
 def test_errors_are_those_of_encode_and_decode(held_out, coder):
@@ -248,13 +229,6 @@ def test_quantities_are_those_of_the_simulated_body():
         np.testing.assert_allclose(result["angle_to_target"][i], (np.cos(row[18]), np.sin(row[18])))
 
 
-def test_every_task_has_its_quantities():
-    tasks = {name: task.describe() for name, task in TASKS.items()}
-    known = {name: quantities(task, np.ones((1, task.size))) for name, task in tasks.items()}
-    with_target = {name for name, each in known.items() if "bearing_of_target" in each}
-    assert with_target == {"move_to_position", "move_to_pose"}
-
-
 def test_any_other_robots_truth_is_every_feature():
     features = [
         make_feature("height", "m", -1, 1, bounded=True),
@@ -290,14 +264,6 @@ def test_episodes_of_one_row_have_no_dynamics(tmp_path):
         assert {judged.scores[name] for name in ("next", "change")} == {(None, None, None)}
         assert judged.reconstruction.mse[0] is not None
     assert " nan" not in evaluation_text(result)
-
-
-def test_a_feature_that_is_constant_where_it_is_judged_has_no_r2(tmp_path):
-    data = wide([50] * 10, features=6)
-    data.dataset.arrays["observation"][data.test, 3] = 1.7
-    features = reconstruction(make(data, principal_code(data, 2)), HeldOut(data)).features
-    assert features[3].r2[0] is None
-    assert features[4].r2[0] is not None
 
 
 def test_probes_are_ridge_regressions(held_out, coder):
@@ -498,15 +464,6 @@ def test_whether_an_encoder_may_have_seen_the_episodes(data):
     ):
         known = {"fingerprint": source, "seed": seed, **policy}
         assert seen(make(data, principal_code(data, 2), data=known), data) == expected
-
-
-def test_other_features_are_refused(data):
-    other = data.task.replace(id="Other-v0", name="Other-v0")
-    with pytest.raises(InputError, match="it-4 was made for Other-v0, not for face_direction"):
-        diagnose({"it": make(data, ((), ()), task=other)}, data)
-    permuted = data.task.replace(features=tuple(reversed(data.task.features)))
-    with pytest.raises(InputError, match="it-4 was made for other features of face_direction"):
-        diagnose({"it": make(data, ((), ()), task=permuted)}, data)
 
 
 def test_what_symmetry_leaves_out_is_no_success(data):

@@ -30,7 +30,7 @@ from jbrep.collect.replay import replay_problems
 from jbrep.dataset import Dataset, from_arrays
 from jbrep.dataset.formats import FORMATS, export, open_source
 from jbrep.dataset.formats.writer import write
-from jbrep.dataset.manifest import shard_name
+from jbrep.dataset.manifest import shard_path
 from jbrep.dataset.verify import find_problems
 from jbrep.encoders import find
 from jbrep.envs import describe
@@ -677,7 +677,7 @@ def test_damage_is_noticed_and_nothing_is_simulated_again(written, tmp_path):
     folder = shutil.copytree(written.folder, tmp_path / "copy")
     with pytest.raises(InputError, match=r"copy was imported: .* import that again in another"):
         list(replay_problems(Dataset(folder), 1))
-    flip_bit(folder / shard_name(0), -8)
+    flip_bit(shard_path(folder, 0), -8)
     assert len(list(find_problems(folder))) == 1
     with pytest.raises(InputError, match=r"was imported; import its source, pushes of a"):
         list(repair(folder))

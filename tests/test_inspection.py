@@ -26,7 +26,7 @@ from jbrep.inspection.episode import POINTS, SPACING, record_episode, sweep
 from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot, rotate, shapes
 from jbrep.inspection.scene import contacts, shades
-from jbrep.inspection.signals import MOST_LINES, panels, principal_components
+from jbrep.inspection.signals import panels, principal_components
 from jbrep.play import jitterbug
 from jbrep.play.jitterbug import reward_terms
 from jbrep.play.sources import find_episode
@@ -132,17 +132,6 @@ def test_every_body_and_geom_of_the_model_is_there(entities, robot):
     assert sum(len(robot.geoms(body)) for body in robot.bodies) == 22
     assert {"/world/floor/floor", "/world/surroundings/target"} <= {*entities}
     assert values(entities["/world/surroundings/target"], "Ellipsoids3D:colors").shape == (1, 2)
-
-
-def test_shapes_are_the_models(entities, robot):
-    weight = entities["/world/robot/jitterbug/weight"]
-    geom = robot.model.geom("weight")
-    np.testing.assert_allclose(values(weight, "Ellipsoids3D:half_sizes")[0, 0], geom.size)
-    np.testing.assert_allclose(values(weight, "Ellipsoids3D:centers")[0, 0], geom.pos, rtol=1e-6)
-    assert values(weight, "Ellipsoids3D:colors")[0, 0] == 0xD93326FF  # .85 .2 .15
-    leg = entities["/world/robot/jitterbug/leg1_lower"]
-    assert values(leg, "Cylinders3D:lengths").item() == pytest.approx(0.065)
-    np.testing.assert_allclose(values(leg, "Ellipsoids3D:half_sizes")[0, 0], [0.003] * 3)
 
 
 def test_poses_are_the_episodes(entities, rollout):
@@ -257,14 +246,6 @@ def test_an_encoder_that_keeps_all_gives_the_robot_back(unchanged):
     np.testing.assert_allclose(heading, np.linalg.norm(heading[0]) * axis, atol=1e-5)
 
 
-def test_colours_go_from_small_errors_to_large():
-    shown = shades(np.array([0, 1e-3, 1e-2, 1e-1, 1]))
-    np.testing.assert_array_equal(shown[[0, 3], :3], [(59, 82, 139), (253, 231, 37)])
-    np.testing.assert_array_equal(shown[[0, 3]], shown[[1, 4]])
-    assert (np.diff(shown[:4, 1].astype(int)) >= 0).all()
-    assert (shown[:, 3] < 255).all()
-
-
 def test_principal_components():
     random = np.random.default_rng(0)
     latent = random.normal(size=(200, 5)) * (0.1, 3, 0.1, 1, 0.1)
@@ -287,17 +268,6 @@ def test_recordings_are_small_and_bring_their_layout(recording, request):
     chunks = [columns(chunk) for chunk in RrdReader(path).stream(store=layout)]
     name = "TimePanelBlueprint:play_state"
     assert [each[name].to_pylist() for each in chunks if name in each] == [[[2]]]  # playing
-
-
-def test_the_provenance(entities, rollout):
-    told = text(entities["/provenance"])
-    encoder = find("dae-8", rollout.task)
-    facts = (
-        *(f"# {FACE}, episode 1", "- task: face_direction", f"- seed: {rollout.seed}"),
-        *(f"- return: {rollout.episode_return:.1f}", "- end: truncated", encoder.fingerprint),
-        *("- encoder: dae-8 (dae)", "- sizes: 16 features, 8 units", "- jbrep: ", "- mujoco: "),
-    )
-    assert all(fact in told for fact in facts)
 
 
 def identity(path):
@@ -402,17 +372,6 @@ def test_a_robot_without_mujoco_shows_its_signals(short):
     assert scalars(found["/error/total"]).max() < 1e-6
     assert not any(path.startswith("/world") for path in found)
     assert f"- return: {rollout.episode_return:.1f}" in text(found["/provenance"])
-
-
-def test_hundreds_of_features_are_many_plots_of_few_lines(short):
-    rollout, found = short("Humanoid-v5")
-    plots = {path: entity for path, entity in found.items() if path.startswith("/observation/")}
-    groups = rollout.task.groups.values()
-    assert len(plots) == sum(-(-(place.stop - place.start) // MOST_LINES) for place in groups)
-    assert max(len(names(entity)) for entity in plots.values()) <= MOST_LINES
-    together = np.concatenate([scalars(plots[path]) for path in plots], axis=1)
-    assert sorted(together[5]) == sorted(rollout.observation[5].astype(float))
-    assert {"/action_0-7", "/action_8-16"} <= {*found}
 
 
 def test_a_time_step_that_is_not_known_leaves_the_steps(folder):
@@ -720,13 +679,3 @@ def test_the_viewer_ends_with_jbrep(number, viewer, brief, tmp_path):
         assert wait_for(told.exists, process)
         process.send_signal(number)
     wait_for_the_end_of([json.loads(told.read_text())[0]], seconds=30)
-
-
-def test_a_robot_whose_features_were_renamed_is_shown(tmp_path):
-    names = [*map("sensor_{}".format, range(16))]
-    renamed = tmp_path / "names.toml"
-    renamed.write_text("".join(f'[[features]]\nname = "{name}"\n' for name in names))
-    task = ("--task", "face_direction", "--features", renamed)
-    out = tmp_path / "shown.rrd"
-    assert jbrep("inspect", "heuristic", *task, "--encoder", "full", "--out", out).exit_code == 0
-    assert out.exists()

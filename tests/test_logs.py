@@ -249,7 +249,7 @@ def test_rewards_for_data_that_exist_already(tmp_path, rewards):
     replayed = jbrep("data", "verify", data.folder, "--replay", "2")
     assert "2 episodes simulated again: equal in every bit" in replayed.output
     (data.folder / "shard-00000.h5").unlink()
-    assert "gave the rewards; derive the data set again" in mistake("data", "repair", data.folder)
+    assert "gave the rewards; derive them again" in mistake("data", "repair", data.folder)
     derive = ("data", "derive", tmp_path / "collected", "--out")
     for name, problem in {
         "my_rewards:scalar": "gives an array of shape () for 30 steps: it must be (30,)",
@@ -317,7 +317,7 @@ BAD = {
     "the angle 'gyro' in 'rad/s'": ({}, (*NAMED, "--angles", "gyro")),
     "has no observation 'u': it has pitch, gyro, ticks": ({}, (*NAMED, "--angles", "u")),
     "an episode comes in two parts": ({"status": {9: "b"}}, (*NAMED, "--episode", "status")),
-    "missing is 'hld:1': it must be skip, or hold and": (
+    "missing is 'hld:1'": (
         {"gyro": {5: ""}},
         (*NAMED, "--missing", "hld:1"),
     ),

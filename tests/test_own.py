@@ -288,9 +288,9 @@ def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
     shown = evaluation_text(evaluation, everything=True)
     assert re.search(r"^half .* +- +-$", shown, re.MULTILINE)  # no error, in no unit
     plots = {plot.name: plot for plot in encoder_plots(evaluation)}
-    assert {row[0] for row in plots["error_by_feature"].rows} == {"whole"}
+    assert {row["encoder"] for row in plots["error_by_feature"].rows} == {"whole"}
     for plot in plots.values():
-        plot.draw()
+        assert plot.figure
     alone = evaluation.replace(encoders={n: own[n] for n in ("full", "half")})
     names = ["prediction_by_feature", "prediction_by_horizon"]
     assert [plot.name for plot in encoder_plots(alone)] == names

@@ -39,11 +39,11 @@ def die(folder):
     return "survived"
 
 
-def kill_worker_of_first_run(*names):
+def kill_worker_of_first_run(name):
     """Used instead of `work`."""
-    if "first" in names:
+    if name == "first":
         os.kill(os.getpid(), signal.SIGKILL)
-    return [f"outcome of {name}" for name in names]
+    return f"outcome of {name}"
 
 
 def hang(folder):
@@ -129,10 +129,10 @@ def test_a_run_that_kills_its_workers_crashes_alone(monkeypatch):
     from jbrep.study import runner
 
     monkeypatch.setattr(runner, "work", kill_worker_of_first_run)
-    monkeypatch.setattr(runner, "_job", lambda plan, pack: (*(cell.name for cell in pack),))
+    monkeypatch.setattr(runner, "_job", lambda plan, cell: (cell.name,))
     names = ("first", "second", "third", "fourth")
-    first, second, third, fourth = (SimpleNamespace(name=name) for name in names)
-    *others, crashed = runner.on_this_machine(None, [(second, first), (third,), (fourth,)], 2)
+    cells = [SimpleNamespace(name=name) for name in names]
+    *others, crashed = runner.on_this_machine(None, cells, 2)
     assert sorted(others) == ["outcome of fourth", "outcome of second", "outcome of third"]
     assert (crashed.name, crashed.status) == ("first", "crashed")
     assert crashed.message.startswith("its worker was killed 5 times, perhaps because memory ran")

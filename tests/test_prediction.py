@@ -13,6 +13,7 @@ from jbrep.coordinates import wrapped
 from jbrep.dataset import Column, Dataset, ScaledDataset
 from jbrep.encoders import Encoder, Layer
 from jbrep.encoders.header import EncoderHeader
+from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.evaluate import control, diagnose, regression
 from jbrep.evaluate.control import GoodPolicy, PlayedEpisode, lost, needs, returns_to_go
@@ -210,9 +211,8 @@ def test_nothing_is_said_where_it_cannot_be(evaluation):
         needs=dict.fromkeys(evaluation.needs, 0.0),
         encoders=codes | {"full": full.replace(prediction=still)},
     )
-    told = evaluation_text(constant)
-    assert "can't be said: no reward is known that varies over the held-out steps" in told
-    assert not re.search(r"noise +nothing", told)
+    assert judge(constant).unsaid
+    assert not re.search(r"noise +nothing", evaluation_text(constant))
     blind = {k: a.replace(rewarded=unknown, reward=unknown, mean=unknown) for k, a in still.items()}
     nothing = evaluation.replace(encoders=codes | {"full": full.replace(prediction=blind)})
     assert "next to nothing" in judge(nothing).unsaid
@@ -222,7 +222,7 @@ def test_nothing_is_said_where_it_cannot_be(evaluation):
 def test_the_nearest_code_tells_something_and_lacks_nothing_if_one_does(evaluation):
     def telling(label, r2, loses=()):
         known = evaluation.encoders[label]
-        ahead = known.prediction["10"].replace(rewarded=Score(r2, None, None))
+        ahead = known.prediction["10"].replace(rewarded=Score(r2))
         return known.replace(prediction=known.prediction | {"10": ahead}, loses=loses)
 
     lost = evaluation.encoders["without load"].loses
@@ -253,6 +253,7 @@ def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkey
     assert not any({"value", "action"} & {*each.scores} for each in result.encoders.values())
     assert "return to go" not in evaluation_text(result)
     assert find_good_policy(None, held_out.data.task) is None
+    assert find_good_policy(None, describe("face_direction"), own_rewards=True) is None
     cut = [PlayedEpisode(np.zeros((101, 4), np.float32), np.ones(100), False)] * 5
     short = GoodPolicy("short", controller, cut)
     assert set(networks(code(held_out.data, "place"), held_out, short).of_policy) == {"action"}

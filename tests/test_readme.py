@@ -94,10 +94,10 @@ def test_ten_minutes_lead_from_a_robot_to_a_code(tmp_path, monkeypatch):
     monkeypatch.setattr(regression, "_STEPS", 100)
     monkeypatch.chdir(tmp_path)
     (study,) = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs/worth.md").read_text(), re.M | re.S)
-    short = {"seeds": "1", "steps": "100", "evaluate_every": "100", "final_episodes": "2"}
-    for key, value in short.items():  # of [data], too
-        study = re.sub(rf"^{key} = .*$", f"{key} = {value}", study, flags=re.M)
-    (tmp_path / "choice.toml").write_text(study)
+    for key, value in {**STUDY, "final_episodes": "2"}.items():
+        study = re.sub(rf"^{key} = .*\n", "", study, count=1, flags=re.M)
+        study = f"{key} = {value}\n{study}"
+    (tmp_path / "choice.toml").write_text(study.replace("steps = 20_000", "steps = 2_000"))
     told = [jbrep(*words) for words in map(lessened, commands("docs/worth.md"))]
     assert [each.exit_code for each in told] == [0] * len(told), told
     assert re.search(r"(Take|No code|Which code)", told[4].output)

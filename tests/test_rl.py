@@ -512,7 +512,7 @@ def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
         ({"steps": 0}, "steps is 0"),
         ({"steps": 10**23}, f"steps is {10**23}: it must be"),
         ({"evaluate_every": -1}, "evaluate_every is -1"),
-        ({"evaluation_episodes": 10_001}, "evaluation_episodes is 10001: .* 1 to 10,000"),
+        ({"evaluation_episodes": 10_001}, "evaluation_episodes is 10001"),
         ({"evaluation_episodes": 3, "final_episodes": 2}, "final_episodes is 2: .* as many as"),
     ],
 )

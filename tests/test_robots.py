@@ -19,14 +19,11 @@ from jbrep.collect import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.verify import find_problems
 from jbrep.encoders.wrapper import Encoded
-from jbrep.envs import Lanes, describe, instances
+from jbrep.envs import describe, instances
 from jbrep.envs.autoreset import AutoresetLanes
-from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.make import make_env
 from jbrep.envs.names import import_modules
-from jbrep.envs.recording import whole_outcome
-from jbrep.envs.separate import Retries
-from jbrep.errors import InputError, Notice
+from jbrep.errors import InputError
 from jbrep.pool import Pool, WorkerError
 from jbrep.rl import Run, speed
 from jbrep.rl.files import read_run
@@ -204,20 +201,6 @@ def test_a_class_describes_itself(made, monkeypatch):
         describe("Mine-v0")
 
 
-def test_features_of_a_batch_have_no_offsets():
-    task = describe("face_direction").replace(offsets={"position_x": 100.0})
-    with pytest.raises(InputError, match="is stepped as a batch: its features have no offsets"):
-        Lanes(task, 1)
-
-
-@pytest.mark.parametrize("algorithm", ["sac", "a2c"])
-def test_what_an_estimate_opens_is_closed(algorithm):
-    task = describe("Pendulum-v1", max_episode_steps=20)
-    run = Run.of(task, algorithm, steps=400, evaluation_episodes=1, overrides={"num_envs": 2})
-    assert estimate(run) > 0
-    assert not instances._used
-
-
 @pytest.mark.parametrize("algorithm", ["sac", "a2c"])
 def test_an_estimate_is_of_steps_and_evaluations(algorithm, monkeypatch):
     """Where whatever is timed takes 5 seconds: some steps of learning, or an evaluation."""
@@ -287,16 +270,16 @@ def test_what_fails_is_closed_kept_and_tried_again(tmp_path):
     (tmp_path / "log").unlink()
     robot = arm(tmp_path, fails=[probe + 2 * STEPS + 7])
     command = ("collect", *robot, "--steps", 100, "--threads", 1, "--out", tmp_path / "d")
-    told = jbrep(*command, "--shard-episodes", 50)
+    told = jbrep(*command, "--shard-episodes", 2)
     assert told.exit_code == 2
     assert "OSError: no answer; 2 episodes of 50 rows are kept" in told.output
     assert events(tmp_path) == "ofc"
     assert not list(find_problems(tmp_path / "d"))
     assert len(Dataset(tmp_path / "d")) == 50
-    told = jbrep(*command, "--shard-episodes", 50)  # the port has no such step any more
+    told = jbrep(*command, "--shard-episodes", 2)  # the port has no such step any more
     assert told.exit_code == 0, told.output
     Arm.steps_of_all = 0
-    peace = (*command[:-1], tmp_path / "e", "--shard-episodes", 50, "--retries", 1)
+    peace = (*command[:-1], tmp_path / "e", "--shard-episodes", 2, "--retries", 1)
     told = jbrep(*peace)
     assert told.exit_code == 0, told.output
     assert "no answer; retrying" in told.stderr
@@ -325,22 +308,6 @@ def test_a_robot_that_cannot_be_opened_at_once_again_is_tried_again(tmp_path, mo
     )
     assert told.exit_code == 0, told.output
     assert len(Dataset(tmp_path / "d")) == 100
-
-
-def test_an_episode_that_fails_each_time_ends_it_whatever_the_others_do():
-    task = describe("Sledges/Broken-v0", {"how": "raises", "seed": 12}, 10)
-    lanes = Lanes(task, 3, retries=Retries(1))
-    begun = 0
-
-    def begin():
-        nonlocal begun
-        begun += 1
-        assert begun < 5
-        return lambda observation: np.zeros((3, 3))
-
-    with pytest.warns(Notice, match="retrying"), pytest.raises(EnvironmentFailedError):
-        whole_outcome(lanes, begin, 11)
-    assert begun == 2
 
 
 def test_evaluations_and_training_go_on_after_failures(tmp_path):

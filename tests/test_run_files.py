@@ -305,40 +305,10 @@ def test_evaluating_a_run(run):
     assert "step" not in record
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--encoder", "dae-8"), "which has its own encoder: leave out --encoder"),
-        (("--task", "move_to_pose"), "is of face_direction, not of move_to_pose"),
-        (("--episodes", "1e9"), "1,000,000,000 episodes are too many: at most 10,000"),
-    ],
-)
-def test_options_that_a_run_refuses(arguments, message, run):
-    assert message in mistake("evaluate-policy", run, *arguments)
-
-
-def test_which_encoder_a_policy_by_name_observes_through(tmp_path):
-    file = tmp_path / "own.safetensors"
-    save(find("dae-8", TASK), file)
-    played = ("evaluate-policy", "heuristic", "--episodes", 1, "--encoder")
-    told = jbrep(*played, "dae-8").output
-    assert told.startswith("encoder: dae-8, shipped\nface_direction, heuristic on dae-8, decoded: ")
-    record = json.loads(jbrep(*played, file, "--json").output)
-    assert record["encoder"] == str(file)
-    assert record["representation"] == "dae-8, decoded"
-    assert f"median return {record['median']:.0f} [" in told
-
-
 def test_episodes_are_as_long_as_the_run_s(run):
     shorten(run, 30)
     (rollout,) = find_player(str(run)).play([0])
     assert len(rollout) == 30
-
-
-def test_more_episodes_than_memory_holds_are_not_played(run):
-    shorten(run, 10**6, evaluation_episodes=10_000, final_episodes=10_000)
-    told = refused(find_player(str(run)).play, range(10_000))
-    assert "plays 10,000 episodes of 1,000,000 steps at once" in told
 
 
 def test_another_encoder_is_not_the_run_s(run):

@@ -15,6 +15,7 @@ from jbrep.collect.backends import make_episodes
 from jbrep.collect.derive import derive
 from jbrep.collect.shards import Simulator
 from jbrep.dataset import Dataset
+from jbrep.dataset.schema import joined
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
@@ -114,7 +115,7 @@ def test_a_worker_makes_the_same_episodes(runs, tmp_path):
     each = chosen.shard_episodes
     second = range(each, 2 * each)
     sent = pickle.loads(pickle.dumps((known, Simulator(chosen, actor, 1, 1), second)))
-    made, dataset = make_episodes(*sent).columns, Dataset(tmp_path / "data")
+    made, dataset = joined(make_episodes(*sent)), Dataset(tmp_path / "data")
     start = dataset.manifest.shards[0].rows
     rows = slice(start, start + len(made["action"]))
     np.testing.assert_array_equal(made["action"], dataset["action"][rows])
@@ -211,7 +212,7 @@ def test_what_can_t_be_collected_with_is_said_in_one_line(runs, data, tmp_path):
         InputError, match="the folder of a run with a policy or checkpoint, or a mixture"
     ):
         gather("nothing/here", tmp_path / "other")
-    with pytest.raises(InputError, match=r"holds a data set with other settings: task .*, policy"):
+    with pytest.raises(InputError, match="other settings: task"):
         gather(runs / "sledge", data, task=SLEDGE, store_state=False)
     record = json.loads((runs / "jb" / RUN).read_text())
     code = shutil.copytree(runs / "jb", tmp_path / "code")

@@ -52,6 +52,7 @@ def blinded(encoder: Encoder, name: str, feature: str) -> Encoder:
     size = encoder.size
     nothing = Layer(np.eye(size, dtype=np.float32), np.zeros(size, np.float32), "linear")
     first, *others = encoder.encoder or (nothing,)
+    assert isinstance(first, Layer)  # as jbrep's own methods make them
     weight = first.weight.copy()
     weight[:, encoder.task.feature_names.index(FEATURES[feature])] = 0
     layers = (first._replace(weight=weight), *others)

@@ -64,8 +64,8 @@ def collect(out: Path, **options: Any) -> None:
     The same command resumes an unfinished data set and leaves a finished one as it is; with more
     --steps it extends it, to the data that one command with as many collects. The numbers of lanes
     and threads and the backend don't change the data. A robot that exists once needs --threads 1.
-    Episodes that are finished are kept whatever happens. The policy of a run is kept with the data
-    as it is at the start, also if the run goes on.
+    Whole shards are kept whatever happens. The policy of a run is kept with the data as it is at
+    the start, also if the run goes on.
     """
     from jbrep import api
 

@@ -291,13 +291,13 @@ def import_model(
     graph; onnxruntime runs it.
     """
     from jbrep.encoders.card import card
+    from jbrep.encoders.encoder import Encoder
     from jbrep.encoders.file import SUFFIX, save_new
-    from jbrep.encoders.imported import convert
     from jbrep.records.storage import exists, taken
 
     task = needed_task(options)
     if exists(out):
         raise taken(out)
-    made = convert(model, task, decoder, name or out.name.removesuffix(SUFFIX))
+    made = Encoder.from_onnx(model, task, decoder, name or out.name.removesuffix(SUFFIX))
     save_new(made, out)
     echo_text(card(made, str(out), terminal_width()))

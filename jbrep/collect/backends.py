@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from jbrep.collect.shards import Growth, Made, Produce, Simulator, all_of
+from jbrep.collect.shards import Growth, Produce, Simulator
 from jbrep.dataset.schema import Columns
 from jbrep.envs.instances import close_kept
 from jbrep.envs.make import is_batched
@@ -22,6 +22,7 @@ from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
 
 _PIECES = 10  # of a shard: what a worker makes at a time
 _AHEAD = 4  # pieces for each worker, begun or held until those before are made
+Made = list[Columns | InputError]  # episodes, and what ended them early
 
 
 def local(simulator: Simulator) -> Produce:
@@ -82,7 +83,7 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
                     pool.submit(coming, known, simulator, coming)
                     ahead.waiting.append(coming)
                 if ahead.waiting[0] in made:
-                    yield from all_of(made.pop(ahead.waiting.popleft()))
+                    yield from _whole(made.pop(ahead.waiting.popleft()))
                     continue
                 piece, result = pool.result()
                 if result is not None:
@@ -102,7 +103,7 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
 def make_episodes(
     known: tuple[tuple[str, ...], EnvSpec], simulator: Simulator, episodes: range
 ) -> Made:
-    """Some episodes, in a process of its own.
+    """Make some episodes, in a process of its own.
 
     Args:
         known: modules to import, and what the environment is, if none of them registers it.
@@ -110,12 +111,23 @@ def make_episodes(
         episodes: of one shard.
     """
     modules, spec = known
+    made: Made = []
     try:
         import_modules(modules)
         gymnasium.registry.setdefault(spec.id, spec)
-        return simulator.made(episodes, _stop_on_request)
+        for block in simulator.made(episodes, _stop_on_request):
+            made.append(block)
     except InputError as error:
-        return Made(None, str(error))
+        made.append(InputError(str(error)))  # which can be sent
+    return made
+
+
+def _whole(made: Made) -> Iterator[Columns]:
+    """What was made, and then the failure."""
+    for each in made:
+        if isinstance(each, InputError):
+            raise each
+        yield each
 
 
 def _stop_on_request(steps: int) -> None:
@@ -144,7 +156,7 @@ def on_ray(simulator: Simulator) -> Produce:
                     ahead.waiting.append(make.remote(known, alone, coming))
                 made = ray.get(ahead.waiting[0])
                 ahead.waiting.popleft()
-                yield from all_of(made)
+                yield from _whole(made)
         except ray.exceptions.RayError as error:
             reason = first_line(error)
             raise InputError(f"the cluster could not make episodes: {reason}") from error

@@ -5,6 +5,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from jbrep.collect.backends import BACKENDS
 from jbrep.collect.policies import Policy, make_policy
 from jbrep.collect.replay import replay_problems
@@ -25,7 +27,6 @@ from jbrep.envs.make import is_batched
 from jbrep.errors import DamageError, InputError, choose, differences
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
-from jbrep.records.record import to_plain
 from jbrep.records.storage import check_space, exists, make_folder, write_whole
 from jbrep.text import counted
 
@@ -43,21 +44,11 @@ def collect(
     policy: Policy | None = None,
     retries: int = 0,
 ) -> Manifest:
-    """Collect a data set, or what is missing of it.
+    """Collect a data set, or what is missing of it; `jbrep.collect` says what its arguments are.
 
     The bytes depend neither on lanes, threads or backend, nor on whether a data set is collected at
     once or extended. Before one that is there is continued, an episode of it is played again: it
     must be the same to the last bit, where the environment is reproducible.
-
-    Args:
-        settings: what to collect.
-        folder: new, or with a data set of the same settings that is unfinished or has fewer steps.
-        lanes: environments of a batch, stepped at once.
-        num_threads: threads of a batch, or processes of other environments; None takes one for
-            each core.
-        backend: local, or ray for a cluster.
-        policy: in place of the one that the settings name.
-        retries: how often in a row an episode in which the environment fails is played again.
     """
     policy = policy or make_policy(settings.policy)
     policy.begin(settings.task, [0])  # may refuse the task
@@ -67,21 +58,17 @@ def collect(
     produce = choose(backend, BACKENDS, "backend")(simulator)
 
     def check(wanted: Manifest) -> None:
-        if not wanted.complete:
-            _check_environment(folder, num_threads)
+        """Play an episode of the data set again before it is continued."""
+        if wanted.complete or not settings.task.reproducible:
+            return
+        if any(replay_problems(Dataset(folder), 1, num_threads)):
+            raise InputError(
+                f"{folder} can't be continued: an episode of {settings.task.name} comes out "
+                "differently when it is played again; has the environment changed, or is this "
+                "another machine? Choose another folder for other data"
+            )
 
     return write_shards(settings, folder, produce, policy.files(), check)
-
-
-def _check_environment(folder: Path, num_threads: int | None) -> None:
-    """Play an episode of a data set again."""
-    dataset = Dataset(folder)
-    if dataset.task.reproducible and any(replay_problems(dataset, 1, num_threads)):
-        raise InputError(
-            f"{folder} can't be continued: an episode of {dataset.task.name} comes out differently "
-            "when it is played again; has the environment changed, or is this another machine? "
-            "Choose another folder for other data"
-        )
 
 
 def write_shards(
@@ -162,16 +149,16 @@ def _begin(wanted: Manifest, folder: Path, files: Mapping[str, bytes]) -> Manife
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
     """Check that going on gives what an uninterrupted run gives."""
     steps, own = wanted.settings.steps, there.settings.steps
-    differing = differences(_flat(there.settings), _flat(wanted.settings))
-    if differing and _flat(there.settings) != {**_flat(wanted.settings), "steps": own}:
+    before, now = _plain(there.settings), _plain(wanted.settings)
+    if before != {**now, "steps": own}:
         raise InputError(
-            f"{folder} holds a data set with other settings: {differing}; "
+            f"{folder} holds a data set with other settings: {differences(before, now)}; "
             "choose another folder, or the same settings to resume"
         )
     if steps < own:
         raise InputError(
-            f"{folder} was collected with {own:,} steps and has {there.rows:,} rows so far: it is "
-            f"left as it is; ask for at least as many steps, or choose another folder for {steps:,}"
+            f"{folder} was collected with {own:,} steps: ask for at least as many, or choose "
+            f"another folder for {steps:,}"
         )
     differing = differences(there.versions, wanted.versions)
     if differing and not (there.complete and steps == own):
@@ -181,14 +168,10 @@ def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
         )
 
 
-def _flat(settings: DataSettings) -> dict[str, Any]:
-    """The settings with those of the environment beside them; equal names mean equal features.
-
-    Whether it terminates is left out: it is what was seen of some episodes.
-    """
-    others = ("id", "name", "terminates")
-    task = {n: v for n, v in to_plain(settings.task).items() if n not in others}
-    return {n: v for n, v in settings.as_json().items() if n != "environment"} | task
+def _plain(settings: DataSettings) -> dict[str, Any]:
+    """The settings without whether episodes terminate, which is what was seen of some."""
+    plain = settings.as_json()
+    return plain | {"environment": {**plain["environment"], "terminates": None}}
 
 
 def usual_shard_episodes(
@@ -210,6 +193,6 @@ def usual_shard_episodes(
     if task.terminates is not False:
         policy = policy or make_policy(settings.policy)
         simulator = Simulator(settings, policy, retries=retries)
-        columns = simulator.columns(range(_PILOT), lambda steps: None)
-        length = columns[EPISODES + "length"].mean()
+        played = simulator.made(range(_PILOT), lambda steps: None)
+        length = np.mean([steps for each in played for steps in each[EPISODES + "length"]])
     return max(1, round((_BATCH_ROWS if is_batched(task) else SHARD_ROWS) / length))

@@ -1,7 +1,6 @@
 """Deriving data sets from the same motion: another task's, with other rewards or less to see."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from jbrep.collect.policies import acts_on_observations
 from jbrep.collect.replay import replay_problems
 from jbrep.collect.shards import Growth, Produce
 from jbrep.dataset import Dataset, DataSettings
-from jbrep.dataset.manifest import Entry, Manifest, new_manifest, open_shard, shard_image
+from jbrep.dataset.manifest import Manifest, new_manifest, open_shard, shard_image
 from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns, some_episodes
 from jbrep.dataset.verify import policy_files
@@ -46,38 +45,35 @@ def derive(
         source: a finished data set with stored states.
         task_name: the task to observe and reward.
         folder: where to write; an unfinished derivation is resumed.
-        store_state: store the states as well.
-        num_threads: threads to use; None takes one for each core.
+        store_state: whether to store the states as well.
+        num_threads: to use; None takes one for each core.
     """
-    dataset = Dataset(source)
-    settings = dataset.manifest.settings
-    if dataset.task.name not in TASKS:
-        raise InputError(
-            f"{source} is of {dataset.task.name}: only the Jitterbug's tasks share their motion"
-        )
+    dataset = _finished(source)
+    settings, before = dataset.manifest.settings, dataset.task
+    if before.name not in TASKS:
+        raise InputError(f"{source} is of {before.name}: only the Jitterbug's tasks share motion")
     if not settings.store_state:
         raise InputError(f"{source} has no states: collect it with --store-state")
-    _check_finished(dataset)
     if acts_on_observations(settings.policy):
         raise InputError(
             f"{source} was collected by a {settings.policy['kind']} policy, which acts on "
             f"observations: run jbrep collect --task {task_name} instead"
         )
-    if dataset.task.view:
+    if before.view:
         raise InputError(f"{source} shows a part of its states: derive the task from the whole")
     check_counts(1, num_threads)
-    task, before = get_task(task_name), dataset.task
+    task = get_task(task_name)
     described = task.describe(before.arguments, before.max_episode_steps)
     settings = settings.replace(task=described, store_state=store_state, reward=UNSET)
-    _check_versions(dataset, settings)
-    _check_replay(dataset, settings, num_threads)
+    is_earlier = _is_of_earlier(dataset, settings)
+    if is_earlier and (problem := next(replay_problems(dataset, 1, num_threads), None)):
+        raise InputError(f"{problem}. A derived data set needs the same states")
     if (dataset.episodes["length"] < before.max_episode_steps).any():
         raise InputError(
             f"the physics diverged in {source}, after which no state is stored: run jbrep collect "
             f"--task {task_name} instead"
         )
-    derived = _Deriver(task, settings, num_threads)
-    produce = _each_shard(dataset, derived)
+    produce = _each_shard(dataset, _observed(task, settings, num_threads))
     return write_shards(settings, folder, produce, source=dataset.manifest)
 
 
@@ -97,12 +93,8 @@ def derive_view(
         history: likewise.
         reward: as `reward_function` takes it, for rewards of what the source shows; its own if
             empty.
-
-    Raises:
-        DamageError: the file of a policy that acted in it is damaged or missing.
     """
-    dataset = Dataset(source)
-    _check_finished(dataset)
+    dataset = _finished(source)
     settings = dataset.manifest.settings
     changes = list[Callable[[Columns], Columns]]()
     if reward:
@@ -112,7 +104,7 @@ def derive_view(
     if hidden or history > 1:
         settings = settings.replace(task=with_view(settings.task, hidden, history))
         changes.append(_seen(settings.task))
-    _check_versions(dataset, settings)
+    _is_of_earlier(dataset, settings)
 
     def changed(columns: Columns) -> Columns:
         for change in changes:
@@ -133,19 +125,14 @@ def _check_derived(
 
     Settings alone don't say so: they are the same of a log that was imported once more.
     """
-    source, known = dataset.folder, dataset.manifest
-
-    def made(shard: int, episodes: int) -> Entry:
-        columns = change(open_shard(source, known, shard))
-        return shard_image(wanted, shard, some_episodes(columns, 0, episodes))[0]
-
-    entries = enumerate(wanted.shards)
-    is_same = len(wanted.shards) <= len(known.shards) and all(
-        made(shard, entry.episodes) == entry for shard, entry in entries
-    )
+    known, is_same = dataset.manifest, len(wanted.shards) <= len(dataset.manifest.shards)
+    for shard, entry in enumerate(wanted.shards if is_same else ()):
+        columns = change(open_shard(dataset.folder, known, shard))
+        made, _ = shard_image(wanted, shard, some_episodes(columns, 0, entry.episodes))
+        is_same = is_same and made == entry
     if not is_same:
         raise InputError(
-            f"{folder} was derived from other data than {source}: choose another folder"
+            f"{folder} was derived from other data than {dataset.folder}: choose another folder"
         )
 
 
@@ -174,13 +161,15 @@ def _seen(task: Task) -> Callable[[Columns], Columns]:
     return change
 
 
-def _check_finished(dataset: Dataset) -> None:
+def _finished(source: Path) -> Dataset:
+    dataset = Dataset(source)
     if not dataset.manifest.complete:
-        raise InputError(f"{dataset.folder} is unfinished: resume it with the same jbrep collect")
+        raise InputError(f"{source} is unfinished: resume it with the same jbrep collect")
+    return dataset
 
 
-def _check_versions(dataset: Dataset, settings: DataSettings) -> None:
-    """Check that MuJoCo, NumPy and h5py are those of a data set; jbrep may be later."""
+def _is_of_earlier(dataset: Dataset, settings: DataSettings) -> bool:
+    """Whether another jbrep made a data set; MuJoCo, NumPy and h5py must be the same."""
     earlier = dataset.manifest.versions
     versions = new_manifest(settings, dataset.manifest).versions
     if differing := differences({**earlier, "jbrep": versions["jbrep"]}, versions):
@@ -188,15 +177,7 @@ def _check_versions(dataset: Dataset, settings: DataSettings) -> None:
             f"{dataset.folder} was collected with other versions: {differing}; a derived data set "
             "needs the same"
         )
-
-
-def _check_replay(dataset: Dataset, settings: DataSettings, num_threads: int | None) -> None:
-    """Check that this jbrep gives the states of a data set, if another has made it."""
-    now = new_manifest(settings, dataset.manifest).versions["jbrep"]
-    if dataset.manifest.versions["jbrep"] != now and (
-        problem := next(replay_problems(dataset, 1, num_threads), None)
-    ):
-        raise InputError(f"{problem} A derived data set needs the same states")
+    return earlier["jbrep"] != versions["jbrep"]
 
 
 def _each_shard(dataset: Dataset, change: Callable[[Columns], Columns]) -> Produce:
@@ -212,18 +193,15 @@ def _each_shard(dataset: Dataset, change: Callable[[Columns], Columns]) -> Produ
     return produce
 
 
-@dataclass(frozen=True)
-class _Deriver:
-    """Makes the shards of a data set as another task observes and rewards them."""
+def _observed(
+    task: JitterbugTask, settings: DataSettings, num_threads: int | None
+) -> Callable[[Columns], Columns]:
+    """Shows columns as another task observes and rewards them."""
 
-    task: JitterbugTask
-    settings: DataSettings
-    num_threads: int | None
-
-    def __call__(self, columns: Columns) -> Columns:
+    def change(columns: Columns) -> Columns:
         own = episode_columns(columns)
         length = own["length"]
-        starts = [self.task.start(np.random.default_rng(int(seed))) for seed in own["seed"]]
+        starts = [task.start(np.random.default_rng(int(seed))) for seed in own["seed"]]
         target = {
             "target_position": np.stack([start.target_position for start in starts]),
             "target_quaternion": np.stack([start.target_quaternion for start in starts]),
@@ -237,25 +215,26 @@ class _Deriver:
             **{n: np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in ("qpos", "qvel")},
             **{name: np.repeat(values, length + 1, axis=0) for name, values in constants.items()},
         }
-        observation, reward = self._read(states)
+        observation, reward = read(states)
         changed = {
             "observation": observation[row],
             "reward": reward[row + 1],
             EPISODES + "final_observation": observation[final],
             **{EPISODES + name: values for name, values in target.items()},
         }
-        return self.settings.columns({**columns, **changed})
+        return settings.columns({**columns, **changed})
 
-    def _read(self, states: Mapping[str, Array]) -> tuple[Array, Array]:
+    def read(states: Mapping[str, Array]) -> tuple[Array, Array]:
         """Observations (n, d) and rewards (n,) of states, as `Simulation.restore` takes them."""
         n = len(states["qpos"])
         lanes = min(_LANES, n)
-        body = self.settings.task.arguments
-        simulation = Simulation(self.task, lanes, self.num_threads, **body)
-        observation = np.empty((n, self.settings.task.size), np.float32)
+        simulation = Simulation(task, lanes, num_threads, **settings.task.arguments)
+        observation = np.empty((n, settings.task.size), np.float32)
         reward = np.empty(n, np.float32)
         for start in range(0, n, lanes):
             rows = slice(min(start, n - lanes), start + lanes)  # the last ones overlap
             simulation.restore(**{name: values[rows] for name, values in states.items()})
             observation[rows], reward[rows] = simulation.observe(), simulation.reward()
         return observation, reward
+
+    return change

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Protocol
 
@@ -56,11 +57,9 @@ class Constants(Record, frozen=True):
     open_loop: ClassVar[bool] = True  # whether actions don't depend on what is observed
 
     def files(self) -> dict[str, bytes]:
-        """None are needed."""
         return {}
 
     def settings(self) -> dict[str, Any]:
-        """The settings that `make_policy` takes."""
         return {"kind": self.kind, **to_plain(self)}
 
 
@@ -70,7 +69,6 @@ class Uniform(Constants, frozen=True):
     kind: ClassVar[str] = "uniform"
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        """Draw the actions of the episodes, some steps at a time."""
         randoms, shape = generators(task, seeds), (_BLOCK, task.action_size)
 
         def blocks() -> Iterator[NDArray[Any]]:
@@ -89,7 +87,6 @@ class Constant(Constants, frozen=True):
     drive: _Drive = 1.0
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        """Nothing is drawn."""
         actions = task.unscale_action(np.full((len(seeds), task.action_size), self.drive))
         return lambda observation: actions
 
@@ -100,7 +97,6 @@ class Still(Constants, frozen=True):
     kind: ClassVar[str] = "still"
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        """Nothing is drawn."""
         actions = np.tile(task.rest, (len(seeds), 1))
         return lambda observation: actions
 
@@ -118,28 +114,26 @@ class OrnsteinUhlenbeck(Constants, frozen=True):
     sigma: Annotated[float, Meta(ge=0, le=1e6)] = 0.3  # [1/sqrt(s)]
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        """Draw the actions of the episodes, some steps at a time."""
-        timestep = task.known_timestep
+        timestep, randoms = task.known_timestep, generators(task, seeds)
         if self.theta * timestep > 1:
             raise InputError(
                 f"theta is {self.theta:g}: with steps of {timestep:g} s it must be in "
                 f"[0, {1 / timestep:g}]"
             )
-        return _one_by_one(self._blocks(task, timestep, generators(task, seeds)))
-
-    def _blocks(
-        self, task: Task, timestep: float, randoms: Sequence[np.random.Generator]
-    ) -> Iterator[NDArray[Any]]:
         shape = (_BLOCK, task.action_size)
-        drive = np.full((len(randoms), task.action_size), self.mu)
-        while True:
-            noise = np.stack([r.standard_normal(shape) for r in randoms], axis=1)
-            drives = np.empty_like(noise)
-            for step, increment in enumerate(noise):
-                drives[step] = drive
-                drive = drive + self.theta * timestep * (self.mu - drive)
-                drive = drive + self.sigma * np.sqrt(timestep) * increment
-            yield task.unscale_action(drives)
+
+        def blocks() -> Iterator[NDArray[Any]]:
+            drive = np.full((len(randoms), task.action_size), self.mu)
+            while True:
+                noise = np.stack([r.standard_normal(shape) for r in randoms], axis=1)
+                drives = np.empty_like(noise)
+                for step, increment in enumerate(noise):
+                    drives[step] = drive
+                    drive = drive + self.theta * timestep * (self.mu - drive)
+                    drive = drive + self.sigma * np.sqrt(timestep) * increment
+                yield task.unscale_action(drives)
+
+        return _one_by_one(blocks())
 
 
 class Heuristic(Constants, frozen=True):
@@ -149,7 +143,6 @@ class Heuristic(Constants, frozen=True):
     open_loop: ClassVar[bool] = False
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        """Nothing is drawn."""
         if task.name not in HEURISTICS:
             raise InputError(
                 f"{task.name} has no hand-written policy: choose another policy than {self.kind}; "
@@ -170,15 +163,12 @@ class Mixture:
     parts: tuple[tuple[float, Policy], ...]  # weights, which are positive, and policies
 
     def files(self) -> dict[str, bytes]:
-        """Those of its parts."""
         return {name: file for _, policy in self.parts for name, file in policy.files().items()}
 
     def settings(self) -> dict[str, Any]:
-        """The settings that `make_policy` takes."""
         return {"kind": MIXTURE, "parts": [[w, policy.settings()] for w, policy in self.parts]}
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        """Act with the part that is drawn for each episode."""
         weights = [weight for weight, _ in self.parts]
         drawn = np.array([episode_part(seed, weights) for seed in seeds], int)
         actors: list[tuple[NDArray[np.intp], Actor]] = []
@@ -230,16 +220,13 @@ def parse_policy(text: str, other: Callable[[str], Policy | None] = lambda text:
 
 
 def _weight(text: str) -> float:
-    try:
-        weight = float(text)
-    except ValueError:
-        weight = math.nan
-    if not 0 < weight < _MAX_WEIGHT:
-        raise InputError(
-            f"the weight {text!r} must be a positive number below 1e12: each part of a mixture "
-            "has one, as in uniform:0.8+heuristic:0.2"
-        )
-    return weight
+    with suppress(ValueError):
+        if 0 < (weight := float(text)) < _MAX_WEIGHT:
+            return weight
+    raise InputError(
+        f"the weight {text!r} must be a positive number below 1e12: each part of a mixture has "
+        "one, as in uniform:0.8+heuristic:0.2"
+    )
 
 
 def acts_on_observations(settings: Mapping[str, Any]) -> bool:

@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.collect.policies import Policy, make_policy
+from jbrep.collect.replay import why_not_again, why_otherwise
 from jbrep.collect.shards import LANES, Simulator
 from jbrep.dataset.manifest import Manifest, open_shard, read_manifest, shard_image, shard_path
-from jbrep.dataset.schema import DataSettings
+from jbrep.dataset.schema import joined
 from jbrep.dataset.verify import policy_files
 from jbrep.envs.lanes import check_counts
 from jbrep.errors import DamageError, InputError
@@ -22,18 +23,16 @@ def repair(
     num_threads: int | None = None,
     make: Callable[[Mapping[str, Any]], Policy] = make_policy,
 ) -> Iterator[str]:
-    """Make damaged and missing shards again from their seeds.
+    """Make damaged and missing shards again from their seeds; yields a line for each.
 
     Args:
         folder: of the data set.
-        lanes: robots stepped at once.
-        num_threads: threads to step them on; None takes one for each core.
+        lanes: environments of a batch.
+        num_threads: of a batch; None takes one for each core.
         make: makes the policy from what the manifest says of it.
-
-    Yields:
-        A line for each shard that is restored.
     """
     check_counts(lanes, num_threads)
+    read_manifest(folder)  # so that nothing is locked that isn't a data set
     with exclusive(folder):
         manifest = read_manifest(folder)
         settings = manifest.settings
@@ -42,28 +41,15 @@ def repair(
                 open_shard(folder, manifest, shard)
             except DamageError:
                 path = shard_path(folder, shard)
-                if reason := _why_not(settings):
+                reason = why_not_again(settings)
+                if settings.reward:
+                    reason = f"{settings.reward} gave the rewards; derive them again elsewhere"
+                if reason:
                     raise InputError(f"{path} can't be restored: {reason}") from None
                 simulator = Simulator(settings, make(settings.policy), lanes, num_threads)
                 write_whole(path, _image(simulator, manifest, shard, path))
                 yield f"{path} restored"
         policy_files(folder, manifest)
-
-
-def _why_not(settings: DataSettings) -> str:
-    """Why no episode of a data set can be simulated again; empty if it can be."""
-    if settings.is_imported:
-        source = settings.policy["source"]
-        return f"the data set was imported; import its source, {source}, again in another folder"
-    if settings.reward:
-        gave = f"{settings.reward} gave the rewards"
-        return f"{gave}; derive the data set again in another folder"
-    if not settings.task.reproducible:
-        return (
-            f"{settings.task.name} is not reproducible, the same seed and actions lead to other "
-            "states; collect again in another folder"
-        )
-    return ""
 
 
 def _image(simulator: Simulator, manifest: Manifest, shard: int, path: Path) -> bytes:
@@ -73,13 +59,12 @@ def _image(simulator: Simulator, manifest: Manifest, shard: int, path: Path) -> 
     with Progress(total=entry.rows, unit="step", unit_scale=True, desc=path.name) as progress:
         try:
             episodes = range(first, first + entry.episodes)
-            made, image = shard_image(manifest, shard, simulator.columns(episodes, progress.update))
+            blocks = [*simulator.made(episodes, progress.update)]
         except InputError as error:
             again = "; derive the data set again in another folder" if task.view else ""
             raise InputError(f"{path} can't be restored: {error}{again}") from None
+    made, image = shard_image(manifest, shard, joined(blocks))
     if made != entry:
-        raise InputError(
-            f"{path} can't be restored here: it comes out differently; use the robot as it was, on "
-            f"the machine it was made on, with these versions: {dict(manifest.versions)}"
-        )
+        why = why_otherwise(manifest)
+        raise InputError(f"{path} can't be restored here: it comes out differently; {why}")
     return image

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset import Dataset, Episode
+from jbrep.dataset import Dataset, DataSettings, Episode
+from jbrep.dataset.manifest import Manifest
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Read, Recording, Tick, open_loop, read_nothing, read_states, record
@@ -20,47 +21,47 @@ _LANES = 100
 def replay_problems(
     dataset: Dataset, episodes: int, num_threads: int | None = None
 ) -> Iterator[str]:
-    """Play some episodes again and compare every bit.
+    """Play so many episodes again; yields a line for each that differs in a bit.
 
-    Args:
-        dataset: with the episodes.
-        episodes: how many; they are drawn at random, always the same ones.
-        num_threads: threads to step a batch on; None takes one for each core.
-
-    Yields:
-        A line for each episode that differs.
+    They are drawn at random, always the same ones.
     """
-    total = len(dataset.episodes["length"])
+    total, settings = len(dataset.episodes["length"]), dataset.manifest.settings
     if not 0 <= episodes <= total:
         raise InputError(f"{episodes} episodes can't be replayed: the data set has {total:,}")
     if not episodes:
         return  # without a look at the environment, whose package need not be there
-    if dataset.manifest.settings.is_imported:
-        raise InputError(
-            f"{dataset.folder} was imported: to compare it with its source, import that again in "
-            "another folder"
-        )
-    if not dataset.task.reproducible:
-        raise InputError(
-            f"episodes can't be replayed: {dataset.task.name} is not reproducible, the same seed "
-            "and actions lead to other states"
-        )
+    if reason := why_not_again(settings):
+        raise InputError(f"episodes of {dataset.folder} can't be replayed: {reason}")
     numbers = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
     chosen = [dataset.episode(int(number)) for number in numbers]
-    steps = sum(map(len, chosen))
     lanes = _LANES if is_batched(dataset.task) else 1
-    with Progress(total=steps, unit="step", unit_scale=True, leave=False) as bar:
+    read = read_states if settings.store_state else read_nothing
+    with Progress(total=sum(map(len, chosen)), unit="step", unit_scale=True, leave=False) as bar:
         for first in range(0, episodes, lanes):
             some = chosen[first : first + lanes]
-            read = read_states if dataset.manifest.settings.store_state else read_nothing
             recording = simulate_again(some, read, bar.update, num_threads)
             for lane, episode in enumerate(some):
                 if not _is_equal(recording, lane, episode):
-                    yield (
-                        f"{dataset.folder}: episode {episode.number} simulated again differs: has "
-                        "the robot changed, or is this another machine, or other versions than "
-                        f"{dict(dataset.manifest.versions)}?"
-                    )
+                    what = f"{dataset.folder}: episode {episode.number} simulated again differs"
+                    yield f"{what}: {why_otherwise(dataset.manifest)}"
+
+
+def why_not_again(settings: DataSettings) -> str:
+    """Why no episode of a data set can be simulated again; empty if it can be."""
+    if settings.is_imported:
+        source = settings.policy["source"]
+        return f"they were imported; import their source, {source}, again in another folder"
+    if not settings.task.reproducible:
+        return f"{settings.task.name} is not reproducible; collect again in another folder"
+    return ""
+
+
+def why_otherwise(manifest: Manifest) -> str:
+    """Why an episode may come out differently."""
+    return (
+        "use the robot as it was, on the machine it was made on, with these versions: "
+        f"{dict(manifest.versions)}"
+    )
 
 
 def simulate_again(
@@ -72,7 +73,7 @@ def simulate_again(
         episodes: of one data set, at least one.
         read: what to record besides observations and rewards.
         tick: called after each step.
-        num_threads: threads to step a batch on; None takes one for each core.
+        num_threads: of a batch; None takes one for each core.
     """
     dataset = episodes[0].dataset
     if dataset.manifest.settings.is_imported:

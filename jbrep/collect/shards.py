@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from jbrep.errors import InputError
 
 LANES = 100  # of a batch
 SHARD_ROWS = 20_000  # of a shard of the usual size, unless a batch makes it
-_LENGTH = EPISODES + "length"
 
 Array = NDArray[Any]
 
@@ -33,25 +32,16 @@ class Growth:
 
     Attributes:
         manifest: of the full shards that are there.
+        rows, episodes: how many there are, in files or held for the next one.
     """
 
     def __init__(self, folder: Path, manifest: Manifest):
-        self._folder = folder
-        self._each = manifest.settings.shard_episodes
+        self.rows, self.episodes = manifest.rows, manifest.episodes
+        self._folder, self._each = folder, manifest.settings.shard_episodes
         full = manifest.episodes // self._each
         begun = range(full, len(manifest.shards))  # the last one, if it isn't full
         self._held = [open_shard(folder, manifest, shard) for shard in begun]
         self.manifest = manifest.replace(shards=manifest.shards[:full])
-
-    @property
-    def rows(self) -> int:
-        """How many there are, written or not."""
-        return self.manifest.rows + sum(len(each["step"]) for each in self._held)
-
-    @property
-    def episodes(self) -> int:
-        """How many there are, written or not."""
-        return self.manifest.episodes + sum(len(each[_LENGTH]) for each in self._held)
 
     @property
     def lacking(self) -> int:
@@ -63,15 +53,17 @@ class Growth:
 
         Judging by the mean of those that are there, or else by the usual size of a shard.
         """
-        longest = self.manifest.task.max_episode_steps
-        usual = min(longest, SHARD_ROWS / self._each)
+        usual = min(self.manifest.task.max_episode_steps, SHARD_ROWS / self._each)
         mean = self.rows / self.episodes if self.episodes else usual
         return (episode - self.episodes) * mean < self.lacking
 
     def add(self, columns: Columns) -> None:
         """Take the next episodes, of one shard, as far as they are needed."""
-        needed = int(np.searchsorted(np.cumsum(columns[_LENGTH]), self.lacking)) + 1
+        lengths = columns[EPISODES + "length"]
+        needed = int(np.searchsorted(np.cumsum(lengths), self.lacking)) + 1
         self._held.append(some_episodes(columns, 0, needed))
+        self.rows += int(lengths[:needed].sum())
+        self.episodes += len(lengths[:needed])
         if self.episodes % self._each == 0 or self.lacking <= 0:
             self.manifest = commit(self._folder, self.manifest, joined(self._held))
             self._held = []
@@ -79,21 +71,6 @@ class Growth:
 
 # the columns of the next episodes that a data set lacks, some of one shard at a time
 Produce = Callable[[Growth, Tick], Iterator[Columns]]
-
-
-class Made(NamedTuple):
-    """What became of some episodes."""
-
-    columns: Columns | None  # of those before a failure; None if there are none
-    failure: str = ""
-
-
-def all_of(made: Made) -> Iterator[Columns]:
-    """What was made, and then the failure."""
-    if made.columns is not None:
-        yield made.columns
-    if made.failure:
-        raise InputError(made.failure)
 
 
 @dataclass(frozen=True)
@@ -119,29 +96,16 @@ class Simulator:
         each = self.settings.shard_episodes
         while True:
             first = growth.episodes
-            episodes = np.arange(first, (first // each + 1) * each)
-            yield from self._blocks(episodes, tick, lambda: growth.lacking)
+            shard = range(first, (first // each + 1) * each)
+            yield from self.made(shard, tick, lambda: growth.lacking)
 
-    def made(self, episodes: range, tick: Tick) -> Made:
-        """Some episodes of a shard."""
-        blocks, failure = list[Columns](), ""
-        try:
-            for block in self._blocks(np.array(episodes), tick, lambda: math.inf):
-                blocks.append(block)
-        except InputError as error:
-            failure = str(error)
-        return Made(joined(blocks) if blocks else None, failure)
-
-    def columns(self, episodes: range, tick: Tick) -> Columns:
-        """The columns of some episodes of a shard."""
-        return joined(list(self._blocks(np.array(episodes), tick, lambda: math.inf)))
-
-    def _blocks(
-        self, episodes: Array, tick: Tick, wanted: Callable[[], float]
+    def made(
+        self, shard: range, tick: Tick, wanted: Callable[[], float] = lambda: math.inf
     ) -> Iterator[Columns]:
-        """The columns of the episodes, some at a time, one in each lane, while rows are wanted."""
+        """The columns of episodes of a shard, some at a time, while rows are wanted."""
+        episodes = np.array(shard)
         longest, retries = self.settings.task.max_episode_steps, Retries(self.retries)
-        # side by side, other environments would wait for the longest episode
+        # one in each lane; other environments than a batch would wait for the longest episode
         most = self.lanes if is_batched(self.settings.task) else 1
 
         def at_once() -> int:

@@ -26,22 +26,17 @@ def from_arrays(
     task: Task | str | None = None,
     source: str = "arrays",
 ) -> Dataset:
-    """Write a data set of arrays.
-
-    The first five are of all episodes, one after the other: N steps of d features and actions
-    of k numbers. Or each is a list of such arrays, one for each of the n episodes.
+    """Write a data set of arrays of n episodes, one after the other, or of lists with one of each.
 
     Args:
         folder: new.
-        observations: before each action, (N, d). In a list, the observations of an episode may
-            have one row more than the rest: the final one.
+        observations: before each action, (N, d); in a list, with or without the final one.
         actions: (N, k).
         rewards: (N,); None where none are known.
         terminations: whether a state ended the episode at that step, (N,).
         truncations: whether anything else did, such as a time limit, (N,).
-        final_observations: after the last action of each episode, (n, d). Where they aren't
-            known, the last step of each episode is left out, so that its observation is the
-            final one, and the episode counts as truncated.
+        final_observations: after the last action of each episode, (n, d). Where they aren't known,
+            the last step of each episode is left out, so that its observation is the final one.
         seeds: that the episodes were started with, (n,); -1 where one isn't known.
         task: that they are of, or its name; made from the data alone if not given.
         source: where they come from, a few words; also the id of a task made from the data.
@@ -97,9 +92,6 @@ def from_file(
         layout: as `from_table` takes it, like missing.
         missing: likewise.
         task: likewise; by default the one that the files name, if they do.
-
-    Raises:
-        ModuleNotFoundError: their format needs a package that isn't installed.
     """
     opened = open_sources([*map(str, (file, *more))], layout, missing)
     return _written(folder, opened, task, layout, missing)

@@ -7,7 +7,6 @@ where each column begins.
 import hashlib
 import json
 import mmap
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.envs.task import Task
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import DamageError, InputError, refusing
 from jbrep.records.commit import Commits, commits
 from jbrep.records.document import Document, document_from, parse_json
 from jbrep.records.record import Record, Sha256, Version
@@ -134,14 +133,12 @@ def read_manifest(folder: Path) -> Manifest:
         DamageError: it isn't what jbrep wrote.
     """
     path = folder / MANIFEST
-    try:
-        raw = path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError):
+    if not exists(path):
         raise InputError(
             f"no data set in {folder}: expected a folder that jbrep collect wrote, with {MANIFEST}"
-        ) from None
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from error
+        )
+    with refusing(f"can't read {path}", (OSError,)):
+        raw = path.read_bytes()
     given = parse_json(raw, path, Manifest.format)
     stated = given.pop(_HASH, None)
     manifest = document_from(given, path, Manifest)
@@ -167,14 +164,13 @@ def check_sizes(folder: Path, manifest: Manifest) -> None:
         DamageError: one is missing, or has another size.
     """
     for shard, entry in enumerate(manifest.shards):
-        path = shard_path(folder, shard)
-        _check_size(path, path.stat().st_size if exists(path) else None, entry)
+        _check_size(shard_path(folder, shard), entry)
 
 
-def _check_size(path: Path, size: int | None, entry: Entry) -> None:
-    if size is None:
+def _check_size(path: Path, entry: Entry) -> None:
+    if not exists(path):
         raise DamageError(f"{path} is missing: {REPAIR}")
-    if size != entry.bytes:
+    if (size := path.stat().st_size) != entry.bytes:
         raise DamageError(
             f"{path} is damaged: it has {size:,} bytes instead of {entry.bytes:,}; {REPAIR}"
         )
@@ -193,14 +189,9 @@ def open_shard(folder: Path, manifest: Manifest, shard: int, *, known: bool = Fa
         DamageError: its bytes aren't those that were written, or the file is missing.
     """
     path, entry = shard_path(folder, shard), manifest.shards[shard]
-    try:
-        with path.open("rb") as file:
-            _check_size(path, os.fstat(file.fileno()).st_size, entry)
-            content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except FileNotFoundError:
-        raise DamageError(f"{path} is missing: {REPAIR}") from None
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from error
+    _check_size(path, entry)
+    with refusing(f"can't read {path}", (OSError,)), path.open("rb") as file:
+        content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     if not known and hashlib.sha256(content).hexdigest() != entry.sha256:
         raise DamageError(f"{path} is damaged: its SHA-256 isn't the manifest's; {REPAIR}")
     columns = dict[str, NDArray[Any]]()

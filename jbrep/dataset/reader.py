@@ -1,6 +1,7 @@
 """Reading a data set."""
 
 import hashlib
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -34,17 +35,11 @@ class Split(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One episode of a data set.
-
-    Attributes:
-        dataset: the data set.
-        number: of the episode, from 0.
-        rows: its rows in the columns of the data set.
-    """
+    """One episode of a data set."""
 
     dataset: "Dataset"
-    number: int
-    rows: slice
+    number: int  # from 0
+    rows: slice  # in the columns of the data set
 
     def __len__(self) -> int:
         return int(self.rows.stop - self.rows.start)
@@ -208,26 +203,28 @@ class Dataset:
         return fit_scaler(EXTREMA, self.task, self["observation"], rows)
 
     def describe(self) -> dict[str, Any]:
-        """What it holds, how it was made, its returns and the ranges of its features.
-
-        Returns:
-            Plain values, as JSON takes them; numbers that aren't finite are None.
-        """
-        manifest, episodes = self.manifest, self.episodes
+        """What it holds, how it was made, its returns and the ranges of its features, as JSON."""
+        manifest, settings, episodes = self.manifest, self.manifest.settings, self.episodes
+        note = ""
+        if settings.is_imported:
+            note = "the data were imported: no episode can be simulated again"
+        elif not self.task.reproducible:
+            note = "the environment is not reproducible: no episode can be simulated again"
         return {
             "folder": str(self.folder),
-            **manifest.settings.as_json(),
+            **settings.as_json(),
             "rows": len(self),
+            "complete": manifest.complete,
             "episodes": len(episodes["length"]),
             "terminated": int(episodes["terminated"].sum()),
-            "steps_per_episode": _spread(episodes["length"]),
+            "length": _spread(episodes["length"]),
             "return": _spread(episodes.get("return", ())),
             "columns": list(self.columns),
             "shards": len(manifest.shards),
-            "complete": manifest.complete,
             "bytes": manifest.bytes,
             "versions": dict(manifest.versions),
             "fingerprint": self.fingerprint,
+            **({"note": note} if note else {}),
             "features": self._ranges() if len(self) else [],
         }
 
@@ -245,73 +242,63 @@ class Dataset:
 
     def card(self, width: int = 80) -> str:
         """`describe` as text of at most `width` columns."""
-        about = self.describe()
-        told = f"{self.folder}\n{facts(self._facts(about), width)}"
-        return f"{told}\n\n{_table(about).text(width)}" if len(self) else told
+        named, table = self._card()
+        told = f"{self.folder}\n{facts(named, width)}"
+        return f"{told}\n\n{table.text(width)}" if table.rows else told
 
     def _repr_html_(self) -> str:
-        about = self.describe()
-        told = Table(str(self.folder), ("", ""), [*self._facts(about).items()])
-        return html(told, *([_table(about)] if len(self) else ()))
+        named, table = self._card()
+        return html(Table(str(self.folder), ("", ""), [*named.items()]), table)
 
-    def _facts(self, about: dict[str, Any]) -> dict[str, str]:
-        """What is known of the whole, for people."""
-        settings, task = self.manifest.settings, self.task
-        sizes = counted(task.size, "feature"), counted(task.action_size, "action")
-        unfinished = f"; unfinished, {settings.steps:,} rows were asked for"
+    def _card(self) -> tuple[dict[str, str], Table]:
+        """What is known of the whole, and of each feature."""
+        about, rows = self.describe(), []
+        for each in about.pop("features"):
+            low, high = each["nominal"]
+            usual = "-" if low is None else f"[{number(low, '.4g')}, {number(high, '.4g')}]"
+            values = [number(each[name], ".4g") for name in _RANGES[2:6]]
+            rows.append((each["feature"], each["unit"], *values, usual))
+        sizes = counted(self.task.size, "feature"), counted(self.task.action_size, "action")
+        episodes, length, returns = f"{about['episodes']:,}", about["length"], about["return"]
+        if length:
+            low, high = (f"{length[end]:,.0f}" for end in ("min", "max"))
+            episodes += f" of {low} steps" if low == high else f" of {low} to {high} steps"
+        if ended := about["terminated"]:
+            episodes += f", {ended:,} terminated by a state"
+        unfinished = "" if about["complete"] else f" of {about['steps']:,} that were asked for"
         named = {
-            "task": ", ".join([task.name, *sizes, *task.given_arguments]),
-            "policy": policy_text(settings.policy),
-            "seed": "-" if settings.is_imported else f"{settings.seed}",
-            "rows": f"{len(self):,}",
-            "episodes": _episodes_line(about),
-            "columns": ", ".join(self.columns),
-            "files": f"{counted(about['shards'], 'shard')}, {about['bytes'] / 1e6:,.1f} MB"
-            + ("" if about["complete"] else unfinished),
-            "made with": ", ".join(f"{name} {each}" for name, each in about["versions"].items()),
+            "task": ", ".join([self.task.name, *sizes, *self.task.given_arguments]),
+            "policy": policy_text(about["policy"]),
+            "seed": "-" if self.manifest.settings.is_imported else str(about["seed"]),
+            "rows": f"{about['rows']:,}{unfinished}",
+            "episodes": episodes,
+            "return": _spread_text(returns) if returns else "not known: the data have no rewards",
+            "columns": ", ".join(about["columns"]),
+            "files": f"{counted(about['shards'], 'shard')}, {about['bytes'] / 1e6:,.1f} MB",
+            "made with": ", ".join(f"{name} {what}" for name, what in about["versions"].items()),
             "fingerprint": about["fingerprint"],
         }
-        if returns := about["return"]:
-            of = {name: number(value, ".1f") for name, value in returns.items()}
-            named["return"] = (
-                f"median {of['median']} [10 % {of['p10']}, 90 % {of['p90']}], mean {of['mean']}, "
-                f"from {of['min']} to {of['max']}"
-            )
-        if settings.reward:
-            named["reward"] = f"by {settings.reward}"
-        if settings.unrewarded:
-            named["return"] = "not known: the data have no rewards"
-        if settings.is_imported:
-            named["note"] = "the data were imported: no episode can be simulated again"
-        elif not task.reproducible:
-            named["note"] = "the environment is not reproducible: no episode can be simulated again"
-        return named
+        if code := self.manifest.settings.reward:
+            named["reward"] = f"by {code}"
+        if note := about.get("note"):
+            named["note"] = note
+        return named, Table("", _RANGES, rows)
 
 
-def _episodes_line(about: dict[str, Any]) -> str:
-    line = f"{about['episodes']:,}"
-    if lengths := about["steps_per_episode"]:
-        low, high = lengths["min"], lengths["max"]
-        line += f" of {low:,.0f}" + (f" to {high:,.0f} steps" if low != high else " steps")
-    ended = about["terminated"]
-    return f"{line}, {ended:,} terminated by a state" if ended else line
-
-
-def _table(about: dict[str, Any]) -> Table:
-    """The features and their ranges."""
-    rows = []
-    for each in about["features"]:
-        low, high = each["nominal"]
-        usual = "-" if low is None else f"[{number(low, '.4g')}, {number(high, '.4g')}]"
-        values = [number(each[name], ".4g") for name in _RANGES[2:6]]
-        rows.append((each["feature"], each["unit"], *values, usual))
-    return Table("", _RANGES, rows)
+def _spread_text(values: Mapping[str, float]) -> str:
+    """What `_spread` found, in a line."""
+    shown = {name: number(value, ",.1f") for name, value in values.items()}
+    return (
+        f"median {shown['median']} [10 % {shown['p10']}, 90 % {shown['p90']}], mean "
+        f"{shown['mean']}, from {shown['min']} to {shown['max']}"
+    )
 
 
 def _spread(values: Any) -> dict[str, float]:
-    """Median, 10 % and 90 % quantiles, mean and extrema over the episodes, if there are any."""
+    """Quantiles, mean and extrema over the episodes, if there are any."""
     if not len(values):
         return {}
-    median, p10, p90 = np.percentile(values, (50, 10, 90)).tolist()
-    named = {"median": median, "p10": p10, "p90": p90, "mean": float(values.mean())}
-    return named | {"min": float(values.min()), "max": float(values.max())}
+    low, median, high = np.percentile(values, (10, 50, 90))
+    ends = {"min": values.min(), "max": values.max()}
+    named = {"median": median, "p10": low, "p90": high, "mean": values.mean(), **ends}
+    return {name: float(value) for name, value in named.items()}

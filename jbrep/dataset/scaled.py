@@ -68,9 +68,9 @@ class ScaledDataset:
         """The same rows and split, scaled otherwise.
 
         Args:
-            scaling: a key of jbrep.dataset.scaling.SCALINGS.
-            coordinates: of the observations, in their place; None for these themselves.
-            clip: scaled values stay within [-clip, clip]; None for no limit.
+            scaling: as `fit_scaler` takes it.
+            coordinates: likewise.
+            clip: likewise.
             without: features or coordinates that rows don't have, or groups of such coordinates.
         """
         other = copy(self)

@@ -1,9 +1,9 @@
 """Scaling observations, or coordinates of them, to about [-1, 1]."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,8 @@ from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError, matching
 
 Rows = NDArray[np.int64]
+Features = Sequence[Feature]
+Parts = Callable[[Rows], Iterable[NDArray[Any]]]  # numbers of rows, in parts (n, m)
 Range = tuple[NDArray[Any], NDArray[Any]]  # what becomes -1 and 1, (d,) each
 
 EXTREMA = "extrema"  # the paper's
@@ -108,33 +110,21 @@ def fit_scaler(
         task: of the observations.
         column: of observations (N, d).
         rows: that it is fitted to.
-        coordinates: of the observations; None for these themselves.
-        clip: scaled values stay within [-clip, clip]; None for no limit.
+        coordinates: as in `Scaler`.
+        clip: likewise.
     """
-    low, high = SCALINGS[scaling](_Values(task, column, coordinates), rows)
+    features = coordinates.features if coordinates else task.features
+
+    def parts(rows: Rows) -> Iterator[NDArray[Any]]:
+        found = column.parts(rows)
+        return map(coordinates.forward, found) if coordinates else found
+
+    low, high = SCALINGS[scaling](features, parts, rows)
     return Scaler(low.astype(np.float32), high.astype(np.float32), coordinates, clip)
 
 
-class _Values(NamedTuple):
-    """Observations of a data set, or coordinates of them."""
-
-    task: Task
-    column: Column  # of observations (N, d)
-    coordinates: Coordinates | None
-
-    @property
-    def features(self) -> tuple[Feature, ...]:
-        """What the numbers are."""
-        return self.coordinates.features if self.coordinates else self.task.features
-
-    def parts(self, rows: Rows) -> Iterator[NDArray[Any]]:
-        """The numbers of rows, in parts (n, m)."""
-        parts = self.column.parts(rows)
-        return map(self.coordinates.forward, parts) if self.coordinates else parts
-
-
-def _extrema(values: _Values, rows: Rows) -> Range:
-    return extrema(values.parts(rows))
+def _extrema(features: Features, parts: Parts, rows: Rows) -> Range:
+    return extrema(parts(rows))
 
 
 def extrema(parts: Iterable[NDArray[Any]]) -> Range:
@@ -144,14 +134,11 @@ def extrema(parts: Iterable[NDArray[Any]]) -> Range:
     return np.min(low, axis=0), np.max(high, axis=0)
 
 
-def _nominal(values: _Values, rows: Rows) -> Range:
-    ranges = [usual_range(feature) for feature in values.features]
-    if missing := [f.name for f, r in zip(values.features, ranges, strict=True) if r is None]:
-        raise InputError(
-            f"{values.task.name} has no usual range of {missing[0]}: choose another scaling than "
-            "nominal"
-        )
-    low, high = np.array(ranges).T
+def _nominal(features: Features, parts: Parts, rows: Rows) -> Range:
+    ranges = {feature.name: usual_range(feature) for feature in features}
+    if missing := [name for name, found in ranges.items() if found is None]:
+        raise InputError(f"{missing[0]} has no usual range: choose another scaling than nominal")
+    low, high = np.array([*ranges.values()]).T
     return low, high
 
 
@@ -163,8 +150,8 @@ def usual_range(feature: Feature) -> tuple[float, float] | None:
     return (feature.low, feature.high) if -_MAX_MAGNITUDE < low < high < _MAX_MAGNITUDE else None
 
 
-def _standard(values: _Values, rows: Rows) -> Range:
-    mean, std = mean_and_std(values.parts(rows))
+def _standard(features: Features, parts: Parts, rows: Rows) -> Range:
+    mean, std = mean_and_std(parts(rows))
     return mean - _DEVIATIONS * std, mean + _DEVIATIONS * std
 
 
@@ -181,16 +168,16 @@ def mean_and_std(parts: Iterable[NDArray[Any]]) -> Range:
     return first + mean, np.sqrt(np.maximum(squares / count - mean**2, 0))
 
 
-def _robust(values: _Values, rows: Rows) -> Range:
+def _robust(features: Features, parts: Parts, rows: Rows) -> Range:
     step = -(-len(rows) // _SAMPLED)
-    sampled = np.concatenate(list(values.parts(rows[::step])))
+    sampled = np.concatenate(list(parts(rows[::step])))
     low, median, high = np.quantile(sampled.astype(np.float64), _QUANTILES, axis=0)
     farthest = np.abs(sampled - median).max(axis=0)  # where nearly all rows are the same
     half_width = np.where(low == high, farthest, (high - low) / 2)
     return median - half_width, median + half_width
 
 
-SCALINGS: dict[str, Callable[[_Values, Rows], Range]] = {
+SCALINGS: dict[str, Callable[[Features, Parts, Rows], Range]] = {
     EXTREMA: _extrema,  # minimum and maximum
     NOMINAL: _nominal,  # the task's usual ranges
     "standard": _standard,  # the mean, and three standard deviations to either side

@@ -15,7 +15,6 @@ from jbrep.dataset.settings import (
     MIXTURE,
     CollectSettings,
     PolicySettings,
-    check_policy,
 )
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
@@ -58,7 +57,6 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
     reward: _Code | UnsetType = UNSET  # what has given the rewards, if not the environment
 
     def check(self) -> None:
-        check_policy(self.policy)
         self.specs()
         episode_seed(self.task, self.seed, (self.steps - 1) // self.task.max_episode_steps)
         if self.store_state and not self.task.state:

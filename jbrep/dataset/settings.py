@@ -1,11 +1,11 @@
 """What a user chooses of a data set besides its task: how much of it, and the policy that acts."""
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from msgspec import Meta
 
-from jbrep.records.record import Record, Sha256, converted
+from jbrep.records.record import Record
 
 IMPORTED = "imported"  # data that were made elsewhere
 MIXTURE = "mixture"  # a policy for each episode, by weights
@@ -13,11 +13,7 @@ TRAINED = "trained"  # of a run, kept in a file beside the shards
 MAX_LETTERS = 200  # of a text
 MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 
-_Line = Annotated[str, Meta(max_length=MAX_LETTERS, pattern=r"\A[^\x00-\x1f\x7f-\x9f]*\Z")]
-_Number = Annotated[float, Meta(gt=-(10**12), lt=10**12)]
-_Constants = Mapping[_Line, _Line | _Number]
-_Parts = tuple[tuple[Annotated[float, Meta(gt=0)], Mapping[str, Any]], ...]  # with their weights
-PolicySettings = Mapping[str, Any]
+PolicySettings = Mapping[str, Any]  # a kind and its constants
 
 
 class CollectSettings(Record, frozen=True, kw_only=True):
@@ -44,27 +40,6 @@ class CollectSettings(Record, frozen=True, kw_only=True):
     store_state: Annotated[
         bool, Meta(description="Store the Jitterbug's qpos and qvel, for jbrep data derive.")
     ] = False
-
-
-class _Trained(Record, frozen=True, kw_only=True):
-    """The policy of a run, in a file beside the shards and nowhere else."""
-
-    kind: Literal["trained"]
-    file: Annotated[str, Meta(pattern=r"(?a)\A[\w-]+\.safetensors\Z")]
-    sha256: Sha256
-    run: _Line
-    step: Annotated[int, Meta(ge=0)]
-
-
-def check_policy(policy: PolicySettings) -> None:
-    """Make sure that a policy, or each of a mixture, is a kind and constants that fit it."""
-    kind = converted(policy.get("kind"), _Line, "the kind of a policy")
-    if kind == MIXTURE:
-        parts = converted(policy.get("parts"), _Parts, "the parts of a mixture")
-        for _, part in parts:
-            check_policy(part)
-    else:
-        converted(policy, _Trained if kind == TRAINED else _Constants, "policy")
 
 
 def parts_of(policy: PolicySettings) -> Iterator[PolicySettings]:

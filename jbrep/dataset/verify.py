@@ -12,11 +12,8 @@ from jbrep.dataset.manifest import Manifest, open_shard, read_manifest, shard_pa
 from jbrep.dataset.schema import EPISODES, Columns
 from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.envs.task import Task
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import DamageError
 from jbrep.progress import Progress
-from jbrep.records.storage import read_file
-
-_MAX_POLICY_BYTES = 1 << 28
 
 
 def find_problems(folder: Path) -> Iterator[str]:
@@ -48,15 +45,15 @@ def policy_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:
     """
     files = dict[str, bytes]()
     for policy in (each for each in parts_of(manifest.settings.policy) if each["kind"] == TRAINED):
-        path, raw = folder / policy["file"], b""
-        with suppress(InputError):
-            raw = read_file(path)
+        path, raw = folder / Path(policy["file"]).name, b""
+        with suppress(OSError):
+            raw = path.read_bytes()
         if hashlib.sha256(raw).hexdigest() != policy["sha256"]:
             raise DamageError(
                 f"{path} is damaged or missing: it is the policy of {policy['run']} at step "
                 f"{policy['step']:,}, which only a copy can restore"
             )
-        files[policy["file"]] = raw
+        files[path.name] = raw
     return files
 
 

@@ -1,5 +1,7 @@
 """The encoder: from observations to latents and back, through layers."""
 
+from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, Union
 
 import numpy as np
@@ -7,8 +9,8 @@ import numpy as np
 from jbrep.coordinates import is_torch, library_of
 from jbrep.coordinates.nearest import nearest
 from jbrep.dataset import Scaler
-from jbrep.encoders.base import BaseEncoder, Float32
-from jbrep.encoders.header import EncoderHeader
+from jbrep.encoders.base import BaseEncoder, Float32, OwnEncoder
+from jbrep.encoders.header import IMPORTED, EncoderHeader
 from jbrep.encoders.layers import MAX_UNITS, Layer, check_tensor, run
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
@@ -142,7 +144,26 @@ class Encoder(BaseEncoder):
         from jbrep.encoders.imported import of_modules  # imports onnx
         from jbrep.envs.description import as_task  # imports Gymnasium
 
-        return of_modules(encoder, as_task(task), decoder, name)
+        known = as_task(task)
+        return _imported(known, name, "torch", *of_modules(encoder, known.size, decoder))
+
+    @staticmethod
+    def from_onnx(path: Path, task: Task, decoder: Path | None, name: str) -> "Encoder":
+        """An encoder from ONNX models.
+
+        A model has one input, (n, d) in physical units, and one output; or the outputs `latent` and
+        `reconstruction`, as jbrep exports them. Numbers in other files must be beside it.
+
+        Args:
+            path: of the encoder's model.
+            task: whose observations it reads.
+            decoder: path of a model from latents to observations; None for the encoder's
+                `reconstruction`, or none.
+            name: what tables will call it: lower-case letters, digits and hyphens.
+        """
+        from jbrep.encoders.imported import of_files  # imports onnx
+
+        return _imported(task, name, "onnx", *of_files(path, task.size, decoder))
 
     def with_header(self, **changes: Any) -> "Encoder":
         """The same encoder with other values of some fields in its header."""
@@ -219,3 +240,17 @@ class Encoder(BaseEncoder):
 
     def check_task(self, task: Task) -> None:
         check_same(task, self.task, self.name)  # other arguments, such as another body, will do
+
+
+def _imported(
+    task: Task, name: str, package: str, encoder: "Model", decoder: "Model | None"
+) -> Encoder:
+    """An encoder of models that take physical units, made with a package, once it was tried."""
+    versions = {each: version(each) for each in ("jbrep", "numpy", package)}
+    header = EncoderHeader(kind=IMPORTED, name=name, environment=task, versions=versions)
+    ones: Float32 = np.ones(task.size, np.float32)
+    made = Encoder(header, Scaler(-ones, ones), (encoder,), (decoder,) if decoder else ())
+    tried = OwnEncoder(made, task)
+    if made.can_decode:
+        tried.decode(tried.encode(np.zeros((2, task.size))))
+    return made

@@ -9,7 +9,6 @@ import logging
 import warnings
 from collections.abc import Iterator
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,7 @@ from onnx import ModelProto, TensorProto, helper
 from onnx.utils import Extractor
 
 from jbrep.coordinates import is_torch
-from jbrep.dataset import Scaler
-from jbrep.encoders.base import Float32, OwnEncoder
-from jbrep.encoders.encoder import Encoder
-from jbrep.encoders.header import IMPORTED, EncoderHeader
 from jbrep.encoders.layers import ONNX
-from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line, refusing
 from jbrep.records.storage import exists
 
@@ -101,25 +95,16 @@ def session(content: bytes) -> Any:
     return onnxruntime.InferenceSession(content, options)
 
 
-def convert(path: Path, task: Task, decoder: Path | None, name: str) -> Encoder:
-    """An encoder from ONNX models.
+Models = tuple[Model, Model | None]  # encoder and decoder
 
-    A model has one input, (n, d) in physical units, and one output; or the outputs `latent` and
-    `reconstruction`, as jbrep exports them. Numbers in other files must be beside it.
 
-    Args:
-        path: of the encoder's model.
-        task: whose observations it reads.
-        decoder: path of a model from latents to observations; None for the encoder's
-            `reconstruction`, or none.
-        name: what tables will call it: lower-case letters, digits and hyphens.
-    """
+def of_files(path: Path, size: int, decoder: Path | None) -> Models:
+    """Encoder and decoder from ONNX files, as `Encoder.from_onnx` takes them."""
     proto, back = _read(path)
     if decoder is not None:
         back, _ = _read(decoder)
-    into = _layer(str(path), proto, task.size)
-    out = _layer(str(decoder or path), back, into.units) if back else None
-    return _imported(task, name, into, out, ONNX)
+    into = _layer(str(path), proto, size)
+    return into, _layer(str(decoder or path), back, into.units) if back else None
 
 
 def _read(path: Path) -> tuple[ModelProto, ModelProto | None]:
@@ -191,13 +176,11 @@ def _messages(message: Message) -> Iterator[Message]:
                 yield from _messages(each)
 
 
-def of_modules(encoder: Any, task: Task, decoder: Any, name: str) -> Encoder:
-    """An encoder from torch modules, as `Encoder.from_torch` takes them."""
+def of_modules(encoder: Any, size: int, decoder: Any) -> Models:
+    """Encoder and decoder from torch modules, as `Encoder.from_torch` takes them."""
     decoder = encoder if decoder is None and hasattr(encoder, "decode") else decoder
-    layer, back = _exported(encoder, "encode", task.size), None
-    if decoder is not None:
-        back = _exported(decoder, "decode", layer.units)
-    return _imported(task, name, layer, back, "torch")
+    layer = _exported(encoder, "encode", size)
+    return layer, None if decoder is None else _exported(decoder, "decode", layer.units)
 
 
 def _exported(module: Any, method: str, size: int) -> Model:
@@ -217,17 +200,3 @@ def _exported(module: Any, method: str, size: int) -> Model:
         program = torch.onnx.export(traced, verbose=False)
         assert program
         return _layer(said, program.model_proto, size)
-
-
-def _imported(
-    task: Task, name: str, encoder: Model, decoder: Model | None, package: str
-) -> Encoder:
-    """An encoder of models that take physical units, made with a package, once it was tried."""
-    versions = {each: version(each) for each in ("jbrep", "numpy", package)}
-    header = EncoderHeader(kind=IMPORTED, name=name, environment=task, versions=versions)
-    ones: Float32 = np.ones(task.size, np.float32)
-    made = Encoder(header, Scaler(-ones, ones), (encoder,), (decoder,) if decoder else ())
-    tried = OwnEncoder(made, task)
-    if made.can_decode:
-        tried.decode(tried.encode(np.zeros((2, task.size))))
-    return made

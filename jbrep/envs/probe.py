@@ -153,10 +153,6 @@ def _seed_bits(env: Env) -> SeedBits:
 
 
 def _checked_action(env_id: str, space: spaces.Space[Any]) -> spaces.Box:
-    if type(space).__module__.startswith("gym."):
-        raise InputError(
-            f"{env_id} has spaces of old Gym, {space}: make them with gymnasium.spaces"
-        )
     if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
         raise InputError(
             f"{env_id} has actions in {space}: only continuous ones are possible, a Box of floats"
@@ -185,18 +181,14 @@ def _below(bound: NDArray[Any]) -> Array:
 
 def features_of(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
     """The features of a flat observation, named by the keys of dictionaries, else numbered."""
-    if space.is_np_flattenable and (size := flatdim(space)) > MAX_FEATURES:
-        raise InputError(
-            f"{env_id} has observations of {size:,} numbers, flat: at most {MAX_FEATURES:,} are "
-            "possible"
-        )
     flat = flatten_space(space) if space.is_np_flattenable else None
     if not isinstance(flat, spaces.Box):
         raise InputError(f"{env_id} has observations in {space}, which don't make one flat array")
     parts = [*_parts("", space)]
-    if any(_is_image(part) for _, part in parts):
+    if any(_is_image(part) for _, part in parts) or flat.shape[0] > MAX_FEATURES:
         raise InputError(
-            f"{env_id} has images as observations, {space}: only features are possible"
+            f"{env_id} has observations in {space}: only features are possible, no images, and at "
+            f"most {MAX_FEATURES:,}"
         )
     sizes = [flatdim(part) for _, part in parts]
     numbers = [

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from jbrep.errors import DamageError, InputError
-from jbrep.records.storage import MissingFileError, read_file, write_whole
+from jbrep.records.storage import exists, read_file, write_whole
 
 Tensors = dict[str, NDArray[Any]]
 
@@ -44,19 +44,14 @@ def checksum(tensors: Tensors, header: Mapping[str, Any]) -> str:
 
 
 def read(path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
-    """Tensors and header of such a file, once its checksum has been verified.
-
-    Args:
-        path: the file.
-        what: it should be, for messages, such as "encoder".
+    """Tensors and header of a file of what is named, once its checksum has been verified.
 
     Raises:
         DamageError: it isn't what was written.
     """
-    try:
-        return unpack(read_file(path), path, what)
-    except MissingFileError:
-        raise InputError(f"no {what} at {path}") from None
+    if not exists(path):
+        raise InputError(f"no {what} at {path}")
+    return unpack(read_file(path), path, what)
 
 
 def unpack(raw: bytes, path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:

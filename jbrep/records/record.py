@@ -104,14 +104,13 @@ def _line(message: str, value: Any, kind: Any, where: str) -> str:
         value = _inside(value, field or index)
     if field := _FIELD.fullmatch(reason):
         name = f"{place}.{field[2]}" if place else field[2]
-        is_missing = field[1].startswith("missing")
-        return (
-            f"{name} is missing" if is_missing else f"unknown {name}: it must be {_choices(nodes)}"
-        )
+        if field[1].startswith("missing"):
+            return f"{name} is missing"
+        return f"unknown {name}: {_choices(nodes, 'it must be one of ') or 'there are none'}"
     if reason.startswith("Expected "):
         must_be = reason.removeprefix("Expected ").partition(", got")[0]
     elif reason.startswith("Invalid "):
-        must_be = _choices(nodes)
+        must_be = _choices(nodes, "one of ")
     else:  # what `check` said
         return f"{place}: {reason}" if place else reason
     given = "" if value is UNSET else f" is {shown(value)}: it"
@@ -152,11 +151,12 @@ def _parts(node: inspect.Type, step: str) -> list[inspect.Type]:
     return []
 
 
-def _choices(nodes: Sequence[inspect.Type]) -> str:
-    """The values, or else the names of fields, among which there is a choice."""
+def _choices(nodes: Sequence[inspect.Type], before: str) -> str:
+    """The values, or else the names of fields, among which there is a choice, after some words."""
     values = [each for node in nodes for each in getattr(node, "values", ())]
     fields = (each for node in nodes for each in getattr(node, "fields", ()))
-    return f"one of {', '.join(map(str, values or dict.fromkeys(f.encode_name for f in fields)))}"
+    choices = ", ".join(map(str, values or dict.fromkeys(f.encode_name for f in fields)))
+    return choices and f"{before}{choices}"
 
 
 def type_of(kind: Any) -> inspect.Type:

@@ -14,22 +14,12 @@ from jbrep.records.lock import exclusive
 _PARTIAL = ".partial"
 
 
-class MissingFileError(InputError):
-    """There is no file at a path."""
-
-
 def read_file(path: Path) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        MissingFileError: there is none.
-    """
+    """The bytes of a file."""
     try:
         return path.read_bytes()
     except OSError as error:
-        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
-        kind = MissingFileError if is_missing else InputError
-        raise kind(f"can't read {path}: {error.strerror or error}") from error
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -183,11 +183,10 @@ def lacking(evaluation: Evaluation) -> dict[str, list[Lost]]:
 
 def _everything(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
     """Every other diagnostic that is registered, and what each of them is."""
-    encoders = evaluation.encoders
+    others = [name for name, scalar in SCALARS.items() if not scalar.is_first]
     rows = [
-        (name, *(number(_score(known, name).value, SIGNIFICANT) for known in encoders.values()))
-        for name, scalar in SCALARS.items()
-        if not scalar.is_first
+        (label, *(number(_score(known, name).value, SIGNIFICANT) for name in others))
+        for label, known in evaluation.encoders.items()
     ]
-    yield Table("All other diagnostics", ("diagnostic", *encoders), rows)
+    yield Table("All other diagnostics", ("encoder", *others), rows)
     yield facts({name: scalar.words for name, scalar in SCALARS.items()}, width, 0)

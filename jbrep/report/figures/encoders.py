@@ -77,7 +77,9 @@ def _predicted(encoders: Mapping[str, Diagnostics]) -> Iterator[Row]:
 
 def _lost(encoders: Mapping[str, Diagnostics]) -> Iterator[Row]:
     for label, known in encoders.items():
-        for feature in known.reconstruction.features if known.reconstruction else ():
+        if label == FULL or not known.reconstruction:
+            continue
+        for feature in known.reconstruction.features:
             value, low, high = feature.r2
             yield {"encoder": label, "target": feature.name, "r2": value, "low": low, "high": high}
 
