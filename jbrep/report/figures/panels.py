@@ -182,7 +182,7 @@ def panels(
         for place, ((name,), of_series) in enumerate(by(own, series).items()):
             look = looks[of_series[0][colour or series]]
             mark(axes, of_series, look, plain(str(names.get(name, name))), place)
-        axes.set_title(plain(title(key)))
+        axes.set_title(plain(title(key)), size=7.5 if across <= 3 else 6)
         x, y = axis_labels
         if x in own[0] or number + across >= len(parts):
             axes.set_xlabel(plain(str(own[0].get(x, x))))

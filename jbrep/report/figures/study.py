@@ -77,14 +77,16 @@ def _plot(
     lines, limits = dict[Key, Mapping[str, float]](), dict[Key, Limits]()
     for together in by(rows, *spec.together).values() if spec.values else ():
         values = [each for name in spec.values for each in column(together, name)]
-        values += [0, 3 * max(values)] if _SPREAD in together[0].values() else []  # for intervals
+        is_spread = _SPREAD in together[0].values()
+        values += [0, 3 * max(column(together, "mean"))] if is_spread else []  # for intervals
         ends, solved = [end for name in spec.ends for end in column(together, name)], list[float]()
         own = by(together, *spec.facet)
-        for key in own if _SPREAD not in together[0].values() else ():
+        for key in own if not is_spread else ():
             if spec.played and (group := groups.get(key[:2])):
                 lines[key] = spec.played(group)
-                values += [*lines[key].values(), *filter(None, [group.return_floor])]
-                solved += filter(None, [group.solved])
+                values += lines[key].values()
+                values += [] if group.return_floor is None else [group.return_floor]
+                solved += [] if group.solved is None else [group.solved]
         limits |= dict.fromkeys(own, extent := fitting(values, ends, solved))
         for key in own if solved and extent[0] <= solved[0] <= extent[1] else ():
             lines[key] = {**lines.get(key, {}), "solved": solved[0]}
