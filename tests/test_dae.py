@@ -269,7 +269,7 @@ def test_mistakes_are_named():
     refused("unknown architecture 'wide': choose one of paper, deep", architecture="wide")
     refused("batch_size is 0", batch_size=0)
     refused("epochs is -1", epochs=-1)
-    refused(r"seed is 1000+: it must be .* from 0 to 9,223,372,036,854,775,807", seed=10**20)
+    refused(r"seed is 1000+: it must be", seed=10**20)
     for rate in (0, np.nan, np.inf, 1e9):
         refused("learning_rate is .*", learning_rate=rate)
     for noise in (-1, np.nan, np.inf):

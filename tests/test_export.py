@@ -187,18 +187,16 @@ def exported(to, folder):
     return out / "jitterbug/face_direction/uniform-v0" if to == "minari" else out
 
 
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", FOLDERS)
 def test_what_came_after_the_check_is_not_overwritten(to, dataset, tmp_path, monkeypatch):
     path = exported(to, tmp_path)
     publish = f"jbrep.dataset.formats.{to}.publish"
     original = pydoc.locate(publish)
 
     def come_first(partial, name):
-        if name == path and to in FOLDERS:
+        if name == path:
             path.mkdir()
             (path / "precious").write_text("precious")
-        elif name == path:
-            path.write_text("precious")
         original(partial, name)
 
     monkeypatch.setattr(publish, come_first)

@@ -369,7 +369,7 @@ def test_of_a_wide_robot_the_worst_features_are_shown():
         for i, each in enumerate(r2)
     ]
     lost = Reconstruction(mse=NOTHING, pca_mse=NOTHING, ratio_to_pca=None, features=features)
-    encoders = {"full": diagnostics(348, kind="full", reconstruction=lost)}
+    encoders = {"mine": diagnostics(348, kind="dae", reconstruction=lost)}
     (by_feature,) = encoder_plots(evaluation(encoders, "Humanoid-v5"))
     assert len(by_feature.rows) == 348
     figure = drawn(by_feature)
