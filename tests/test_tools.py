@@ -171,8 +171,8 @@ def test_scores_are_held_against_returns_of_the_same_encoders(tmp_path, capsys, 
     (tmp_path / "scores").mkdir()
     learned = tmp_path / "scores/learned.csv"
     learned.write_text("\n".join(("code,sha256,way,final", *rows)))
-    monkeypatch.setattr(worth, "good_codes", lambda known: ["slow-8", "dae-8"])
-    monkeypatch.setattr(worth, "recommended", lambda known: "dae-8")
+    judged = SimpleNamespace(serving=["slow-8", "dae-8"], take="dae-8")
+    monkeypatch.setattr(worth, "judge", lambda known: judged)
     monkeypatch.setattr(worth, "read_tables", lambda folder: tables)
     monkeypatch.setattr(worth, "read_document", lambda path, kind: evaluation)
     monkeypatch.setattr(worth, "headline", lambda each: each.known)

@@ -131,7 +131,7 @@ def overview(results: Path) -> str:
 
 def _cell(known: Diagnostics) -> str:
     told = headline(known)
-    shown = [told[name] for name in ("rewarded", "times_pca")]
+    shown = [told.get(name) for name in ("rewarded", "times_pca")]
     return ", ".join(f"{value:.2f}" for value in shown if value is not None) or "-"
 
 
