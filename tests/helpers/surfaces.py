@@ -26,7 +26,6 @@ from jbrep.dataset.formats import export, open_source
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.envs.names import environment_versions
-from jbrep.records.document import read_document
 from jbrep.report import make_report
 from jbrep.report.report import MARKDOWN
 from jbrep.report.tables import read_tables
@@ -37,7 +36,7 @@ from jbrep.rl.tune import BEST, SEARCH
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD
-from jbrep.study.registration import REGISTRATION, Registration, find_committed
+from jbrep.study.registration import REGISTRATION, find_committed, registration_in
 from jbrep.study.runner import run_study
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
 
@@ -257,7 +256,7 @@ def _registration():
         command("study", folder / "it.toml", "--register", "--out", folder / "it")
 
     def result(folder):
-        registered = read_document(folder / f"it.{REGISTRATION}", Registration)
+        registered = registration_in(folder / f"it.{REGISTRATION}")
         return registered.study, registered.encoders
 
     def files(folder):
