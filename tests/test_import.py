@@ -34,8 +34,8 @@ from jbrep.dataset.manifest import shard_path
 from jbrep.dataset.verify import find_problems
 from jbrep.encoders import find
 from jbrep.envs import describe
-from jbrep.envs.description import features_of
 from jbrep.envs.names import import_modules
+from jbrep.envs.probe import features_of
 from jbrep.envs.task import check_same
 from jbrep.errors import InputError, Notice
 from jbrep.evaluate.diagnosis import seen
