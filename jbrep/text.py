@@ -79,11 +79,6 @@ def html(*parts: "str | Table") -> str:
     )
 
 
-def possessive(name: str) -> str:
-    """A name in the genitive."""
-    return f"{name}'" if name.endswith("s") else f"{name}'s"
-
-
 def wrapped(text: str, width: int | None) -> str:
     """Text in lines of at most that width; None leaves it on one line."""
     if width is None:

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
@@ -179,6 +180,11 @@ class _Job:
     encoder: BaseEncoder
     settings: RunSettings
 
+    @cached_property
+    def versions(self) -> dict[str, str]:
+        """Of the packages that, with the settings, decide every number."""
+        return versions_of(self.run)
+
 
 def _train(job: _Job, resumes: bool) -> RunRecord:
     """Bring a run to its end, from its checkpoint or from its start."""
@@ -263,7 +269,7 @@ class _Progress(BaseCallback):
         super().__init__()
         self._job, self._history, self._settings = job, history, job.settings
         self._checkpoint, self._draws = checkpoint, dict[str, Any]()
-        self._saver = Saver(job.folder, job.settings, versions_of(job.run), job.session.save_every)
+        self._saver = Saver(job.folder, job.settings, job.versions, job.session.save_every)
         self._evaluator: Evaluator | None = None
 
     def close(self) -> None:
@@ -420,7 +426,7 @@ def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | 
         latent_size=job.encoder.latent_size,
         steps=steps,
         seconds=history.seconds,
-        versions=versions_of(job.run),
+        versions=job.versions,
         commits=commits(),
         cpu=cpu(),
         tables=tables,
