@@ -1,17 +1,37 @@
-"""jbrep from Python: what the commands do, as functions with the same words and defaults.
+"""jbrep from Python: what the commands do, as functions; the commands are read off them.
 
-Each is there as `jbrep.NAME`; the commands call them. A task is the name of one, such as
-face_direction or Hopper-v5, or what `jbrep.describe` returns; data are a `Dataset` or the folder of
-one. What a function works with is imported when it is called.
+Each is there as `jbrep.NAME`. A task is the name of one, such as face_direction or Hopper-v5, or
+what `jbrep.describe` returns; data are a `Dataset` or the folder of one. What a function works with
+is imported when it is called. A `parameter` of which a docstring speaks is an option of the
+command, too: see `jbrep.cli.generator`.
 """
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from jbrep.errors import InputError, Notice
+from msgspec import Meta
+
+from jbrep.dataset.settings import RootSeed, ShardEpisodes, Steps, StoreState
+from jbrep.errors import InputError, Notice, choose
+from jbrep.parameters import (
+    NOTHING,
+    Algorithm,
+    Backend,
+    GivenDrawnTask,
+    GivenTask,
+    Lanes,
+    Normalize,
+    Overrides,
+    Preset,
+    Retries,
+    Seen,
+    Threads,
+    Workers,
+)
+from jbrep.rl.settings import CLASSES, Seed, TrainingSettings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -107,40 +127,41 @@ class Judged(NamedTuple):
 
 
 def collect(
-    task: "Task | str",
+    task: GivenTask,
     out: str | Path,
-    steps: int,
+    steps: Steps,
     *,
     policy: str = "uniform",
-    seed: int = 0,
-    store_state: bool = False,
-    shard_episodes: int | None = None,
-    lanes: int = 100,
-    threads: int | None = None,
-    retries: int = 0,
-    backend: str = "local",
+    seed: RootSeed = 0,
+    store_state: StoreState = False,
+    shard_episodes: ShardEpisodes | None = None,
+    lanes: Lanes = 100,
+    threads: Threads = None,
+    retries: Retries = 0,
+    backend: Backend = "local",
 ) -> "Dataset":
-    """Collect the states that a policy visits, as `jbrep collect` does.
+    """Collect the states that a policy visits.
+
+    The same again resumes an unfinished data set and leaves a finished one as it is; with more
+    `steps` it extends it, to the data that as many at once give. The numbers of lanes and threads
+    and the backend don't change the data. A robot that exists once needs `threads` 1. Whole shards
+    are kept whatever happens. The policy of a run is kept with the data as it is at the start, also
+    if the run goes on.
 
     Args:
         task: whose environment is played; how readings that are missing are treated belongs to it.
         out: a folder: new, or with an unfinished or smaller data set of the same settings.
-        steps: how many; the last episode is completed.
-        policy: uniform, heuristic, the folder of a run, or another that the command takes.
-        seed: root of every episode's seed.
-        store_state: store the Jitterbug's qpos and qvel, too.
-        shard_episodes: episodes in a shard; None for shards of a usual size.
-        lanes: environments that are stepped at once.
-        threads: of a batch, or processes; None for as many as cores, 1 for a robot that exists
-            once.
-        retries: how often in a row an environment that fails is made anew and tried again.
-        backend: local, or ray for a cluster.
+        policy: what acts: uniform, constant:drive=0.5, for the Jitterbug heuristic and trained (see
+            jbrep policies), ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3; the folder of a run; or
+            several with weights, of which each episode has one: uniform:0.5+runs/a:0.5.
     """
     from jbrep.collect.collector import collect as run
     from jbrep.collect.collector import usual_shard_episodes
     from jbrep.dataset import Dataset, DataSettings
+    from jbrep.dataset.settings import TRAINED, parts_of
     from jbrep.envs.description import as_task
     from jbrep.play.sources import find_policy
+    from jbrep.records.storage import exists
 
     folder, known = Path(out), as_task(task)
     if not known.reproducible:
@@ -155,7 +176,10 @@ def collect(
     settings = settings.replace(
         shard_episodes=shard_episodes or usual_shard_episodes(settings, folder, actor, retries)
     )
-    _tell_kept(folder, settings.policy)
+    for part in parts_of(settings.policy):
+        if part["kind"] == TRAINED and exists(folder / part["file"]):
+            acts = f"{part['run']} acts as it did at step {part['step']:,}"
+            _note(f"{acts}, which {folder / part['file']} keeps")
     run(settings, folder, lanes, threads, backend, actor, retries)
     return Dataset(folder)
 
@@ -170,17 +194,7 @@ def train_encoder(
     device: str = "auto",
     **settings: Any,
 ) -> "Encoder":
-    """Make an encoder from a data set, as `jbrep train-encoder` does.
-
-    Args:
-        data: 80 % of its episodes are learned from.
-        out: a folder for the encoder's file; a training that was stopped goes on from there.
-        kind: dae, pca, slow, ...; the command lists them.
-        name: of the encoder and its file; None for what it is, such as dae-8.
-        preset: named settings; of dae: authors, its authors' own.
-        device: cpu, cuda or auto.
-        settings: of the kind, such as latent=8 or on="symmetry".
-    """
+    """Make an encoder from a data set; the parameters are those of `train_encoders`."""
     from jbrep.methods.registry import with_preset
 
     settings = with_preset(kind, preset, settings)
@@ -193,29 +207,29 @@ def train_encoders(
     kind: str = "dae",
     *,
     latent: Sequence[int | str] = (),
-    seeds: int | None = None,
+    seeds: Annotated[int, Meta(ge=1)] | None = None,
     name: str | None = None,
     preset: str | None = None,
     device: str = "auto",
     **settings: Any,
 ) -> "Iterator[Fitted]":
-    """Make several encoders of a kind, one of each latent size and seed.
+    """Make encoders of a kind from a data set, one of each latent size and seed.
 
-    All settings are checked at once; an encoder is made when the next one is asked for:
+    All settings are checked at once; each encoder is made when the next one is asked for:
 
         for made in jbrep.train_encoders("data/face", "encoders", "dae", latent=[12, 8, 4]):
             print(made)
 
     Args:
-        data: as for `train_encoder`.
-        out: a folder for all of them.
-        kind: of all of them.
+        data: a folder from jbrep collect, of which 80 % of the episodes are learned from.
+        out: a folder for the encoder files; a training that was stopped goes on from there.
+        kind: dae, pca, slow, ...; jbrep train-encoder --help lists them with their settings.
         latent: sizes; empty for a kind that has none.
-        seeds: n for one of each of the seeds 0 to n - 1, as NAME-s0; None for the usual one.
-        name: of one latent size; None for what they are.
-        preset: named settings.
-        device: cpu, cuda or auto.
-        settings: of the kind, for all of them.
+        seeds: make so many of each, of the seeds from 0 on: NAME-s0, NAME-s1, ...
+        name: what files and tables call it; by default, what it is, such as dae-8.
+        preset: named settings; of dae: authors, its authors' own.
+        device: where: cpu, cuda, or auto.
+        settings: of the kind, such as on="symmetry".
     """
     from jbrep.methods.registry import each_named, with_preset
 
@@ -234,15 +248,17 @@ def evaluate(
     policy: str | None = None,
     truth: "Dataset | str | Path | None" = None,
 ) -> Judged:
-    """Judge encoders on the held-out part of a data set, as `jbrep evaluate` does.
+    """Judge encoders on the held-out part of a data set.
 
     Args:
         encoders: one, several, or several by names of yours: files, names of shipped ones, torch
             modules, functions.
         data: that they are judged on.
         out: a folder for evaluation.json; None to write nothing.
-        policy: that does the task well; None for the task's hand-written one, if there is one.
-        truth: the data set that `data` was derived from, with what it hides.
+        policy: one that does the task well: a run's folder, or a policy by name; by default the
+            task's hand-written policy, if it has one.
+        truth: the data set that `data` was derived from, with what it hides: how well an encoder
+            estimates what isn't seen.
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
@@ -269,53 +285,60 @@ def evaluate(
 
 
 def train(
-    task: "Task | str",
+    task: GivenDrawnTask,
     out: str | Path,
     *,
-    algorithm: str = "sac",
-    preset: str = "",
-    encoder: Any = "full",
-    seed: int = 0,
-    overrides: Mapping[str, Any] = {},
-    threads: int | None = None,
-    retries: int = 0,
-    wandb: str | None = None,
+    algorithm: Algorithm = "sac",
+    preset: Preset = "",
+    encoder: Seen = "full",
+    seed: Seed = 0,
+    overrides: Overrides = NOTHING,
+    normalize: Normalize = False,
+    threads: Annotated[int, Meta(ge=1, le=4096)] | None = None,
+    retries: Retries = 0,
+    begin_from: Annotated[str, Meta(extra={"option": "from", "metavar": "RUN"})] = "",
+    wandb: Annotated[str | None, Meta(extra={"metavar": "PROJECT"})] = None,
     stop: Callable[[], bool] = lambda: False,
-    **settings: Any,
+    **settings: Annotated[Any, TrainingSettings],
 ) -> Agent:
-    """Train and evaluate one agent, as `jbrep rl` does.
+    """Train and evaluate one agent.
+
+    It sees the full observation, scaled, or an encoder's latent. A checkpoint is written every
+    minute, and on Ctrl-C before the command ends (td3 takes seconds to get there). The same again
+    resumes from it, to the same result. The last one stays: with more `steps` the same goes on from
+    there, to the result that it would have had with as many from the start.
 
     Args:
         task: that it learns.
-        out: a folder for the run; one that was stopped goes on from its checkpoint.
-        algorithm: sac, td3, ddpg, ppo, ...
-        preset: its settings: paper, modern, wide, or a TOML file; empty for wide, or modern where
-            that has none.
-        encoder: what it observes: full, a shipped encoder's name, a file, or an encoder of yours.
+        out: a folder for this run.
         seed: of agent and episodes.
-        overrides: settings other than the preset's, such as {"learning_rate": 3e-4}.
-        threads: of a batch; None for as many as cores, 1 for a robot that exists once.
-        retries: how often in a row an environment that fails is made anew and tried again.
-        wandb: a project of Weights & Biases to log to, too.
+        threads: of a batch, as many as cores by default. 1 is one instance of another environment,
+            as of a robot that exists once: num_envs is 1, in the preset modern unless one is named,
+            and evaluations wait for the end of an episode.
+        begin_from: begin with the final weights of a finished run of the same algorithm and sizes,
+            such as one on another body; optimisers and SAC's entropy coefficient start anew.
+        wandb: log to a project of Weights & Biases, too; WANDB_MODE=offline keeps it in the folder.
         stop: asked before each rollout; once it is true, the run writes a checkpoint and stops.
         settings: of the training: steps, evaluate_every, evaluation_episodes, ...
 
     Raises:
         StoppedError: `stop` was true.
     """
-    from jbrep.envs.description import as_task
     from jbrep.envs.make import is_one_robot
+    from jbrep.rl.settings import MODERN
+
+    known = check_learner(task, algorithm, preset, encoder, begin_from)
     from jbrep.machine import cores
     from jbrep.rl.bar import Bar
-    from jbrep.rl.run import Run
-    from jbrep.rl.settings import MODERN
+    from jbrep.rl.run import Run  # imports torch
     from jbrep.rl.training import Session, standing_of
     from jbrep.rl.training import train as train_run
 
-    known = as_task(task)
     if one_robot := is_one_robot(known, threads):
         preset, settings = preset or MODERN, {**settings, "one_robot": True}
-    run = Run.of(known, algorithm, preset, overrides, encoder=encoder, seed=seed, **settings)
+    overrides = {**overrides, "normalize": True} if normalize else overrides
+    settings |= {"encoder": encoder, "seed": seed, "begin_from": begin_from}
+    run = Run.of(known, algorithm, preset, overrides, **settings)
     if one_robot and run.learner.hyperparameters.num_envs > 1:
         run = run.replace(learner=run.learner.overridden({"num_envs": 1}))
     folder, found = Path(out), run.find_encoder()
@@ -342,28 +365,52 @@ def train(
     return Agent(folder, record, None if isinstance(encoder, str | Path) else encoder)
 
 
+def check_learner(
+    task: "Task | str", algorithm: str, preset: str, encoder: Any, begin_from: str = ""
+) -> "Task":
+    """The task, if all that a learner is named by exists; it takes no time to find that out."""
+    from jbrep.encoders.shipped import check_found
+    from jbrep.envs.description import as_task
+    from jbrep.rl.files import read_finished
+    from jbrep.rl.presets import get_preset, usual_preset
+
+    choose(algorithm, CLASSES, "algorithm")
+    if not preset.endswith(".toml"):
+        get_preset(preset or usual_preset(algorithm), algorithm)
+    if begin_from:
+        read_finished(Path(begin_from))
+    known = as_task(task)
+    if isinstance(encoder, str | Path):
+        check_found(str(encoder), known)
+    return known
+
+
 def study(
     study: "Study | Mapping[str, Any] | str | Path",
-    out: str | Path,
+    out: str | Path | None = None,
     *,
-    workers: int | None = None,
-    backend: str = "local",
+    workers: Workers = None,
+    backend: Backend = "local",
 ) -> "Report":
-    """Train a grid of agents, and report what became of them, as `jbrep study` does.
+    """Train a grid of agents, and report what became of them.
 
     Args:
         study: a `Study`, what its file would hold as a dictionary, or the file.
-        out: a folder; one that was stopped goes on.
-        workers: processes at a time; None for one for each core.
-        backend: local, or ray for a cluster.
+        out: a folder; one that was stopped goes on. By default runs/NAME of the study's file.
     """
-    from jbrep.errors import choose
-    from jbrep.study import Plan, run_study
+    from jbrep.study import Plan, Study, read_study, run_study
+    from jbrep.study.config import as_study
     from jbrep.study.runner import BACKENDS
     from jbrep.text import counted
 
-    file = Path(study) if isinstance(study, str | Path) else None
-    plan, run = Plan(_study(study), Path(out), file), choose(backend, BACKENDS, "backend")
+    if isinstance(study, str | Path):
+        file, known = Path(study), read_study(Path(study))
+        plan = Plan(known, Path(out or Path("runs", file.stem)), file)
+    elif out:
+        plan = Plan(study if isinstance(study, Study) else as_study(study), Path(out), None)
+    else:
+        raise InputError("give out, the folder of the study")
+    run = choose(backend, BACKENDS, "backend")
     for notice in plan.study.notices:
         _note(notice)
     if crashed := run_study(plan, run, workers):
@@ -374,15 +421,16 @@ def study(
 def report(
     folder: str | Path,
     *,
-    evaluation: Sequence[str] = (),
+    evaluation: Annotated[Sequence[str], Meta(extra={"metavar": "FOLDER"})] = (),
     out: str | Path | None = None,
 ) -> "Report":
-    """Show what a study found, as `jbrep report` does.
+    """Say what a study found, and write a page of it.
 
     Args:
         folder: of a study, of runs, or of the tables of a study.
-        evaluation: folders of evaluations of its encoders, whose diagnostics go into the tables.
-        out: a folder for the report; None for the study's own.
+        evaluation: from jbrep evaluate, of encoders of these runs: its diagnostics go into the
+            tables. {task} in it stands for each task. May be repeated.
+        out: a folder for the report; by default the study's own.
     """
     from jbrep.records.storage import exists, make_folder
 
@@ -403,26 +451,6 @@ def _fitter(data: "Dataset | str | Path", out: str | Path, device: str) -> "Fitt
     for constant in scaled.constant_features:
         _note(f"{constant} is constant in the training part")
     return Fitter(scaled, Path(out), device)
-
-
-def _study(given: "Study | Mapping[str, Any] | str | Path") -> "Study":
-    from jbrep.study import Study, read_study
-    from jbrep.study.config import as_study
-
-    if isinstance(given, Study):
-        return given
-    return as_study(given) if isinstance(given, Mapping) else read_study(Path(given))
-
-
-def _tell_kept(folder: Path, policy: Mapping[str, Any]) -> None:
-    """Say which policies of runs the data set has already, as they were then."""
-    from jbrep.dataset.settings import TRAINED, parts_of
-    from jbrep.records.storage import exists
-
-    for part in parts_of(policy):
-        if part["kind"] == TRAINED and exists(folder / part["file"]):
-            known = f"{part['run']} acts as it did at step {part['step']:,}"
-            _note(f"{known}, which {folder / part['file']} keeps")
 
 
 def _note_limits(settings: "RunSettings") -> None:

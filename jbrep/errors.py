@@ -26,6 +26,14 @@ class DamageError(InputError):
     """A file is not what jbrep wrote; the message names it."""
 
 
+class StoppedError(Exception):
+    """A run stopped on request after so many steps, its checkpoint written; `train` resumes it."""
+
+    def __init__(self, step: int):
+        super().__init__(f"stopped after {step:,} steps")
+        self.step = step
+
+
 def first_line(error: BaseException) -> str:
     """The first line of an error's message; the name of its class where it has none."""
     return str(error).strip().partition("\n")[0] or type(error).__name__

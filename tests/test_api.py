@@ -1,6 +1,5 @@
 """jbrep from Python: functions with the words of the commands."""
 
-import inspect
 import subprocess
 import sys
 
@@ -9,7 +8,6 @@ import pytest
 from click.testing import CliRunner
 
 import jbrep
-from jbrep import api
 from jbrep.cli import main
 from jbrep.errors import InputError, Notice
 from jbrep.rl.shipped import find
@@ -105,25 +103,6 @@ def test_a_study_without_a_file(home):
     again = jbrep.report(home / "study", out=home / "elsewhere")
     assert again.page == home / "elsewhere/report.html"
     assert again.returns == found.returns
-
-
-@pytest.mark.parametrize(
-    ("function", "command"),
-    [
-        ("collect", "collect"),
-        ("train_encoder", "train-encoder"),
-        ("train_encoders", "train-encoder"),
-        ("train", "rl"),
-        ("study", "study"),
-    ],
-)
-def test_functions_have_the_defaults_of_the_commands(function, command):
-    given = {each.name: each.default for each in main.commands[command].params}
-    signature = inspect.signature(getattr(api, function)).parameters
-    usual = {name: given[name] for name in signature if type(given.get(name)) in (int, str, bool)}
-    assert usual
-    for name, value in usual.items():
-        assert signature[name].default in (value, None), name
 
 
 def test_modules_are_functions_too_and_nothing_heavy_is_imported():

@@ -22,7 +22,8 @@ from small import adopt, assert_same_files, forge
 from jbrep.encoders import find, save
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.evaluate.table import DIAGNOSTICS, SCALARS
+from jbrep.evaluate.diagnosis import SCALARS
+from jbrep.evaluate.table import DIAGNOSTICS
 from jbrep.play.sources import find_episode
 from jbrep.records.document import document_from, read_document
 from jbrep.records.tables import write_csv, write_rows

@@ -10,7 +10,7 @@ import pytest
 from command import jbrep, refused
 from gymnasium.envs.registration import EnvSpec
 
-from jbrep.cli.environment import parse_arguments
+from jbrep.cli.generator import parse_pairs
 from jbrep.dataset.schema import episode_seed
 from jbrep.envs import Feature, Lanes, Task, describe
 from jbrep.envs.names import import_modules, imported_modules, name_given
@@ -373,4 +373,4 @@ def test_arguments_are_shown_as_the_command_line_takes_them():
     shown = PLAIN.replace(arguments=arguments).given_arguments
     assert shown[:3] == ["mode=fast, or not", 'number="7"', 'nothing="null"']
     assert not [each for each in shown if "\n" in each]
-    assert parse_arguments(shown) == arguments
+    assert parse_pairs(shown) == arguments

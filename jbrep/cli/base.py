@@ -1,6 +1,7 @@
-"""What the commands share: how mistakes are shown, options, numbers as people write them."""
+"""The command line itself: its commands, what they print, and how mistakes are shown."""
 
 import errno
+import json
 import os
 import signal
 import sys
@@ -8,53 +9,27 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from decimal import Decimal
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import click
 
-from jbrep.cli.output import lasting_output, say, tell
+from jbrep.cli.generator import Command
 from jbrep.cli.signals import leave
 from jbrep.errors import InputError, Notice
-from jbrep.text import printable
+from jbrep.text import printable, terminal_width, wrapped
 
-_Command = TypeVar("_Command", bound=Callable[..., Any])
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
-
-class _Count(click.ParamType[int]):
-    """A whole number as people write it: 5000000, 5_000_000, 5e6, 5M, 5k."""
-
-    name = "number"
-
-    def __init__(self, least: int | None = None):
-        self._least = least
-
-    def convert(
-        self, value: str | int, param: click.Parameter | None, ctx: click.Context | None
-    ) -> int:
-        number = self._number(value)
-        if self._least is not None and number < self._least:
-            self.fail(f"{value!r} is too small: it must be at least {self._least}")
-        return number
-
-    def _number(self, value: str | int) -> int:
-        text = str(value).replace("_", "").lower()
-        factor = {"k": 1_000, "m": 1_000_000}.get(text[-1:], 1)
-        digits = text[:-1] if factor > 1 else text
-        try:
-            number = Decimal(digits) * factor
-        except ArithmeticError:
-            number = Decimal("nan")
-        if not (number.is_finite() and abs(number) < _TOO_LARGE and number == int(number)):
-            self.fail(f"{value!r} isn't a whole number: write it as 5000000, 5_000_000, 5e6 or 5M")
-        return int(number)
-
-
-_TOO_LARGE = 10**18
-COUNT, POSITIVE = _Count(), _Count(least=1)
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 RESUMES = "the same command resumes it"
+_ORDER = (  # of work
+    *("env", "collect", "data", "train-dae", "train-encoder", "evaluate", "encoder", "rl", "tune"),
+    *("policies", "policy", "evaluate-policy", "study", "report", "inspect", "render", "doctor"),
+)
+_GROUPS = {
+    "data": "Inspect, repair, derive, import and export data sets.",
+    "encoder": "Look at encoders, export and import them.",
+    "policy": "Export a trained policy for a robot, and check the file.",
+}
 
 
 class _Mistake(click.ClickException):
@@ -95,24 +70,21 @@ def _closing() -> Iterator[None]:
             instances.close_all()
 
 
-class Cli(click.Group):
+class _Cli(click.Group):
     """A user's mistake is one line and exit code 2; anything else shows its traceback."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """In the order of work."""
-        return list(self.commands)
+        return sorted(self.commands, key=_ORDER.index)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the commands: with the options, a terminal of 24 lines wouldn't hold them."""
         self.format_commands(ctx, formatter)
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Run the command line; close what it has opened."""
-        with lasting_output(), _notices(), _closing():
+        with _notices(), _closing():
             return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> None:
-        """Run a command."""
         try:
             super().invoke(ctx)
         except InputError as error:
@@ -140,7 +112,7 @@ class Cli(click.Group):
 def _mistake_of(error: OSError) -> _Mistake | None:
     """What the system refuses as a user's mistake, if it is one."""
     what = f" {error.filename}" if error.filename else ""
-    if error.errno in _FULL:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return _Mistake(
             f"can't write{what}: {os.strerror(error.errno)}; free some space, then run the same "
             "command again"
@@ -150,36 +122,55 @@ def _mistake_of(error: OSError) -> _Mistake | None:
     return None
 
 
-class Variadic(click.Command):
-    """An option that may be repeated also takes several values at once: --latent 12 8 4."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Put the option's name before each of its values."""
-        repeatable = {
-            name
-            for option in self.get_params(ctx)
-            if isinstance(option, click.Option) and option.multiple
-            for name in option.opts
-        }
-        spread: list[str] = []
-        for i, arg in enumerate(args):
-            follows = i > 1 and not arg.startswith("-") and not args[i - 1].startswith("-")
-            name = next((a for a in reversed(args[:i]) if a.startswith("-")), None)
-            spread += [name, arg] if follows and name in repeatable else [arg]
-        return super().parse_args(ctx, spread)
+@click.group(
+    cls=_Cli,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Reduced-order representations of robots, and what they do to learning. Each command's "
+    "--help has an example.",
+)
+@click.version_option(package_name="jbrep")
+def main() -> None:
+    """The command line."""
 
 
-def with_options(*several: Callable[[_Command], _Command]) -> Callable[[_Command], _Command]:
-    """A decorator that gives a command several options, in this order."""
+def command(example: str, kind: type[Command] = Command) -> Callable[[_Function], _Function]:
+    """Make a command of a function, see `jbrep.cli.generator`, which stays as it is.
 
-    def decorate(command: _Command) -> _Command:
-        for option in reversed(several):
-            command = option(command)
-        return command
+    Args:
+        example: for its help; the first word is the command's name, or a group's and the second
+            one the command's.
+        kind: of command.
+    """
+    words = example.split()
+    group: click.Group = main
+    if words[0] in _GROUPS:
+        name = words.pop(0)
+        group = click.Group(name, help=_GROUPS[name], epilog=f"Example: jbrep {example}")
+        group = cast(click.Group, main.commands.setdefault(name, group))
 
-    return decorate
+    def add(function: _Function) -> _Function:
+        group.add_command(kind(words[0], function, example))
+        return function
+
+    return add
 
 
-PATH = click.Path(path_type=Path)
-data_option = click.option("--data", required=True, type=PATH, help="A folder from jbrep collect.")
-as_json = click.option("--json", "as_json", is_flag=True, help="As JSON, for programs.")
+def say(text: str, err: bool = False) -> None:
+    """Print lines as `printable` makes them.
+
+    A reader that has seen enough, as `head` has, is no error: the work goes on.
+    """
+    try:
+        click.echo("\n".join(map(printable, text.split("\n"))), err=err)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2 if err else 1)
+
+
+def tell(line: str, err: bool = False) -> None:
+    """Print a line wrapped at the terminal's edge: one that has no path to copy."""
+    say(wrapped(printable(line), terminal_width()), err=err)
+
+
+def say_json(value: Any) -> None:
+    """Print plain dictionaries, lists, numbers and texts as JSON."""
+    say(json.dumps(value, indent=2, allow_nan=False))

@@ -1,75 +1,42 @@
-"""Collecting data sets, and working with them."""
+"""Tasks, collecting data sets of them, and working with those."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
-import click
+from msgspec import Meta
 
-from jbrep.cli.base import PATH, RESUMES, as_json
-from jbrep.cli.completion import complete_task
-from jbrep.cli.environment import (
-    environment_options,
-    given_task,
-    import_option,
-    needed_task,
-    needed_task_option,
-    retries_option,
-    task_option,
-    threads_option,
-    view_options,
-)
-from jbrep.cli.options import record_options
-from jbrep.cli.output import echo_json, echo_text, say
-from jbrep.cli.signals import deferred_stop, stoppable
+from jbrep import api
+from jbrep.cli.base import RESUMES, command, say, say_json
+from jbrep.cli.signals import stoppable
 from jbrep.dataset.layout import Layout
-from jbrep.dataset.settings import CollectSettings
+from jbrep.dataset.settings import StoreState
 from jbrep.errors import InputError
+from jbrep.parameters import AsJson, Hide, History, Lanes, Out, TaskName, Threads, described
 from jbrep.text import counted, terminal_width
 
-if TYPE_CHECKING:
-    from jbrep.dataset import Dataset
 
-_lanes = click.option(
-    "--lanes",
-    type=click.IntRange(1, 100_000),
-    default=100,
-    show_default=True,
-    help="Environments of a batch, stepped at once.",
-)
-_data = click.argument("data", type=PATH)
+@command("env Hopper-v5")
+def env(task: str, /, *, as_json: AsJson = False, **options: Annotated[Any, described]) -> None:
+    """Say what a task is.
 
-
-@click.command(epilog="Example: jbrep collect --task face_direction --steps 5M --out data/face")
-@needed_task_option
-@record_options(CollectSettings, shard_episodes=None)
-@click.option(
-    "--policy",
-    default="uniform",
-    show_default=True,
-    help="uniform, constant:drive=0.5, ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3, for the "
-    "Jitterbug heuristic and trained (see jbrep policies); the folder of a run; or several with "
-    "weights, of which each episode has one: uniform:0.5+runs/a:0.5.",
-)
-@_lanes
-@threads_option
-@retries_option
-@click.option("--backend", default="local", show_default=True, help="local, or ray for a cluster.")
-@click.option("--out", required=True, type=PATH, help="A folder.")
-@environment_options
-def collect(out: Path, **options: Any) -> None:
-    """Collect the states that a policy visits.
-
-    The same command resumes an unfinished data set and leaves a finished one as it is; with more
-    --steps it extends it, to the data that one command with as many collects. The numbers of lanes
-    and threads and the backend don't change the data. A robot that exists once needs --threads 1.
-    Whole shards are kept whatever happens. The policy of a run is kept with the data as it is at
-    the start, also if the run goes on.
+    Its features, actions and time limit, and whether it is reproducible. TASK is one of the
+    Jitterbug's, such as face_direction, or an id in Gymnasium's registry; for another package's,
+    --import MODULE, or MODULE:ID, which imports it. The environment is made and played for some
+    steps; that it terminates is only known where it did.
     """
-    from jbrep import api
+    known = described(task, **options)
+    assert known
+    from jbrep.envs.description import card
+    from jbrep.records.record import to_plain
 
-    _report(out, lambda: api.collect(needed_task(options), out, **options))
+    say_json(to_plain(known)) if as_json else say(card(known, terminal_width()))
+
+
+@command("collect --task face_direction --steps 5M --out data/face")
+def _collect(out: Path, **options: Annotated[Any, api.collect]) -> None:
+    _report(out, lambda: api.collect(out=out, **options))
 
 
 def _report(out: Path, write: Callable[[], object]) -> None:
@@ -84,72 +51,60 @@ def _report(out: Path, write: Callable[[], object]) -> None:
         write()
     seconds, dataset = time.monotonic() - began, Dataset(out)
     _report_size(out, dataset.manifest)
-    _tell_missing(dataset)
-    if rows := len(dataset) - before:
-        click.echo(f"{rows:,} rows in {seconds:,.0f} s, {rows / seconds:,.0f} a second")
-    else:
-        click.echo("it was complete already: nothing was done")
-
-
-def _tell_missing(dataset: "Dataset") -> None:
-    """Say how many readings were missing."""
     if dataset.task.missing:
         count = int(dataset.episodes["missing"].sum())
         say(f"{counted(count, 'missing reading')} ({dataset.task.missing})", err=True)
+    if rows := len(dataset) - before:
+        say(f"{rows:,} rows in {seconds:,.0f} s, {rows / seconds:,.0f} a second")
+    else:
+        say("it was complete already: nothing was done")
 
 
 def _report_size(out: Path, manifest: Any) -> None:
-    """Print what the folder holds."""
-    size = manifest.bytes / 1e6
-    episodes = counted(manifest.episodes, "episode")
-    what = f"{episodes} of {manifest.task.name}, {manifest.rows:,} rows"
-    say(f"{what}, {size:,.1f} MB in {out}")
+    what = f"{counted(manifest.episodes, 'episode')} of {manifest.task.name}"
+    say(f"{what}, {manifest.rows:,} rows, {manifest.bytes / 1e6:,.1f} MB in {out}")
 
 
-@click.group(epilog="Example: jbrep data info data/face")
-def data() -> None:
-    """Inspect, repair, derive, import and export data sets."""
-
-
-@data.command(epilog="Example: jbrep data info data/face")
-@_data
-@as_json
-def info(data: Path, as_json: bool) -> None:
+@command("data info data/face")
+def info(data: Path, /, *, as_json: AsJson = False) -> None:
     """Show what a data set holds."""
     from jbrep.dataset import Dataset
 
-    if as_json:
-        echo_json(Dataset(data).describe())
-        return
-    echo_text(Dataset(data).card(terminal_width()))
+    known = Dataset(data)
+    say_json(known.describe()) if as_json else say(known.card(terminal_width()))
 
 
-@data.command(epilog="Example: jbrep data verify data/face --replay 50")
-@_data
-@click.option("--replay", default=0, help="Episodes to simulate again and compare bit for bit.")
-@import_option
-@threads_option
-@click.pass_context
-def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> None:
+@command("data verify data/face --replay 50")
+def verify(
+    data: Path,
+    /,
+    *,
+    replay: Annotated[int, Meta(ge=0, le=10**9)] = 0,
+    threads: Threads = None,
+) -> bool:
     """Check the hash of every shard, and the ranges of what is in them.
 
     Prints a line for each problem; the exit code is 1 if there are any.
+
+    Args:
+        replay: episodes to simulate again and compare bit for bit.
     """
     from jbrep.collect.replay import replay_problems
     from jbrep.dataset import Dataset
     from jbrep.dataset.verify import find_problems
 
     if _say_all(find_problems(data)):
-        ctx.exit(1)
+        return True
     dataset = Dataset(data)
     if _say_all(replay_problems(dataset, replay, threads)):
-        ctx.exit(1)
+        return True
     manifest = dataset.manifest
     shards = counted(len(manifest.shards), "shard")
     unfinished = "" if manifest.complete else "; unfinished"
     say(f"{data}: no problems in {len(dataset):,} rows, {shards}{unfinished}")
     if replay:
-        click.echo(f"{counted(replay, 'episode')} simulated again: equal in every bit")
+        say(f"{counted(replay, 'episode')} simulated again: equal in every bit")
+    return False
 
 
 def _say_all(lines: Iterable[str]) -> bool:
@@ -161,12 +116,8 @@ def _say_all(lines: Iterable[str]) -> bool:
     return any_said
 
 
-@data.command(epilog="Example: jbrep data repair data/face")
-@_data
-@import_option
-@_lanes
-@threads_option
-def repair(data: Path, lanes: int, threads: int | None) -> None:
+@command("data repair data/face")
+def repair(data: Path, /, *, lanes: Lanes = 100, threads: Threads = None) -> None:
     """Make damaged and missing shards again from their seeds."""
     from jbrep.collect.repair import repair as run
     from jbrep.play.sources import kept_policy
@@ -177,48 +128,36 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
         say(f"{data} is whole: nothing to repair")
 
 
-@data.command(
-    epilog="Example: jbrep data derive data/face --task move_in_direction --out data/move"
-)
-@_data
-@click.option(
-    "--task",
-    shell_complete=complete_task,
-    help="Another of the Jitterbug's tasks to observe and reward.",
-)
-@record_options(CollectSettings, "store_state")
-@view_options
-@import_option
-@click.option(
-    "--reward",
-    default="",
-    metavar="MODULE:FUNCTION",
-    help="For rewards (n,) of the observations (n, d) and actions (n, k) of an episode; is run.",
-)
-@threads_option
-@click.option("--out", required=True, type=PATH, help="A folder.")
+@command("data derive data/face --task move_in_direction --out data/move")
 def derive(
     data: Path,
-    task: str | None,
-    store_state: bool,
-    hide: tuple[str, ...],
-    history: int,
-    reward: str,
-    threads: int | None,
-    out: Path,
+    /,
+    out: Out,
+    *,
+    task: TaskName = None,
+    store_state: StoreState = False,
+    hide: Hide = (),
+    history: History = 1,
+    reward: Annotated[str, Meta(extra={"metavar": "MODULE:FUNCTION", "is_code": True})] = "",
+    threads: Threads = None,
 ) -> None:
     """Make another data set of the same motion.
 
     It is of another task, has other rewards, or less or more to see. Another task's equals
     collecting that task with the same settings, bit for bit, without simulating again; the source
     needs its states (collect --store-state) and a policy that doesn't depend on observations. The
-    rest can be changed in any data set: --hide leaves features out, --history adds those of the
+    rest can be changed in any data set: `hide` leaves features out, `history` adds those of the
     steps before, and the actions since: an encoder of these estimates what can't be measured.
-    --reward is a function of your own, of what is seen before anything is hidden.
+    `reward` is a function of your own, of what is seen before anything is hidden.
+
+    Args:
+        task: another of the Jitterbug's tasks to observe and reward.
+        reward: for rewards (n,) of the observations (n, d) and actions (n, k) of an episode; is
+            run.
     """
     from jbrep.collect.derive import derive as run
     from jbrep.collect.derive import derive_view
-    from jbrep.envs.names import import_code, is_code
+    from jbrep.envs.names import is_code
 
     if bool(task) == (bool(hide or reward) or history > 1):
         raise InputError("give a --task, or else --hide, --history or --reward")
@@ -228,45 +167,36 @@ def derive(
         raise InputError("--threads is for --task: nothing else is simulated")
     if reward and not is_code(reward):
         raise InputError(f"--reward {reward} must be MODULE:FUNCTION")
-    import_code(reward)
     if task:
         _report(out, lambda: run(data, task, out, store_state, threads))
     else:
         _report(out, lambda: derive_view(data, out, hide, history, reward))
 
 
-@data.command(epilog="Example: jbrep data export data/face --to parquet --out face.parquet")
-@_data
-@import_option
-@click.option("--to", required=True, help="minari, parquet, npz or lerobot.")
-@click.option(
-    "--out", required=True, type=PATH, help="A new folder, or a file that ends in .npz or .parquet."
-)
-def export(data: Path, to: str, out: Path) -> None:
+@command("data export data/face --to parquet --out face.parquet")
+def export(data: Path, /, to: str, out: Path) -> None:
     """Write a data set in another tool's format.
 
-    For minari, --out is a folder of Minari data sets, as MINARI_DATASETS_PATH names it.
+    For minari, `out` is a folder of Minari data sets, as MINARI_DATASETS_PATH names it.
+
+    Args:
+        to: one of minari, parquet, npz and lerobot.
+        out: a new folder, or a file that ends in .npz or .parquet.
     """
     from jbrep.dataset import Dataset
     from jbrep.dataset.formats import export as run
-    from jbrep.dataset.formats import load_format
 
     with stoppable("the export was discarded"):
-        with deferred_stop():
-            load_format(to)
-        click.echo(f"open it with {run(Dataset(data), to, out)}")
+        say(f"open it with {run(Dataset(data), to, out)}")
 
 
-@data.command("import", epilog="Example: jbrep data import D4RL/hopper/expert-v0 --out data/hopper")
-@click.argument("source", nargs=-1, required=True)
-@task_option
-@click.option("--out", required=True, type=PATH, help="A new folder.")
-@record_options(Layout, fill=None)
-@click.option(
-    "--layout", type=PATH, help="A TOML file with the options from --observations to --fill."
-)
-@environment_options
-def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
+@command("data import D4RL/hopper/expert-v0 --out data/hopper")
+def import_data(
+    *source: str,
+    out: Path,
+    layout: Path | None = None,
+    **options: Annotated[Any, Layout, described],
+) -> None:
     """Make a data set of other tools' data, or of logs.
 
     SOURCE is a file (.csv, .tsv, .txt, .parquet, .npz, .hdf5, .h5, .bag, .mcap, .db3), the folder
@@ -274,31 +204,31 @@ def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
     episode ends with each of several. Without --task, the task is the one that the source names, or
     is made from the data alone. See docs/logs.md, and docs/data-format.md for what is known by its
     name.
-    """
-    from jbrep.dataset.formats import load_reader, open_sources
-    from jbrep.dataset.formats.writer import write
-    from jbrep.envs.names import import_code, is_code
 
-    import_code(options["reward"])
-    layout = _layout(options)
-    reward = layout.reward if is_code(layout.reward) else ""
-    told = {name: options[name] for name in ("features", "missing")}
-    if options["task"] is None:
-        if options["hide"] or options["history"] > 1:
+    Args:
+        out: a new folder.
+        layout: a TOML file with the options from --observations to --fill.
+    """
+    from jbrep.dataset.formats import open_sources
+    from jbrep.dataset.formats.writer import write
+    from jbrep.envs.names import is_code
+
+    columns = {n: options.pop(n) for n in Layout.__struct_fields__ if n in options}
+    known = _layout(layout, columns)
+    reward = known.reward if is_code(known.reward) else ""
+    told = {name: options[name] for name in ("features", "missing") if name in options}
+    if "task" not in options:
+        if {"hide", "history"} & {*options}:
             raise InputError(
                 "--hide and --history need a --task here: import without them, and give them to "
                 "jbrep data derive"
             )
-        options |= dict.fromkeys(told)  # they can be said of data alone
-    task = given_task(options)
+        options = {name: each for name, each in options.items() if name not in told}
+    task = described(**options)
     with stoppable("nothing was imported"):
-        with deferred_stop():
-            for each in source:
-                load_reader(each)
-        missing = told["missing"] or (task.missing if task else "") or ""
-        opened = open_sources(source, layout, missing)
-        said = {} if task else _given(told)
-        manifest = write(opened, out, task, **said, reward=reward)
+        missing = told.get("missing") or (task.missing if task else "") or ""
+        opened = open_sources(source, known, missing)
+        manifest = write(opened, out, task, **{} if task else told, reward=reward)
     for note in opened.notes:
         say(note)
     for (noun, what), count in opened.changes().items():
@@ -311,20 +241,13 @@ def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
     _report_size(out, manifest)
 
 
-def _layout(options: dict[str, Any]) -> Layout:
-    """What the columns are by a file, and by options before it; they are taken out."""
-    from jbrep.records.record import from_plain
+def _layout(path: Path | None, given: dict[str, Any]) -> Layout:
+    """What the columns are by a file, and by options before it."""
+    from jbrep.records.record import from_plain, to_plain
     from jbrep.records.toml import read_toml
 
-    given = {name: options.pop(name) for name in Layout.__struct_fields__}
-    path = options.pop("layout")
-    said = {name: value for name, value in given.items() if value not in (None, "")}
     told = read_toml(path) if path else {}
     try:
-        return from_plain({**told, **said}, Layout)
+        return from_plain({**told, **to_plain(given)}, Layout)
     except InputError as error:
         raise InputError(f"{path}: {error}" if path else f"{error}") from None
-
-
-def _given(options: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}

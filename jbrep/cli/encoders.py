@@ -1,25 +1,17 @@
 """Judging and looking at encoders."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import click
+from msgspec import Meta
 
-from jbrep.cli.base import PATH, Variadic, as_json, data_option
-from jbrep.cli.completion import complete_encoder, complete_task
-from jbrep.cli.environment import (
-    environment_options,
-    given_task,
-    import_option,
-    needed_task,
-    needed_task_option,
-    task_option,
-)
-from jbrep.cli.output import echo_json, echo_text, say
+from jbrep import api
+from jbrep.cli.base import command, say, say_json, tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
-from jbrep.text import facts, printable, r2_text, slug, table, terminal_width, wrapped
+from jbrep.parameters import AsJson, NeededTask, OptionalTask, TaskName
+from jbrep.text import facts, r2_text, slug, table, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.encoders import Encoder
@@ -30,53 +22,18 @@ if TYPE_CHECKING:
 
 
 _LETTERS = 100  # of the name of a folder
+_Which = Annotated[str, Meta(extra={"is_code": True, "option": "encoder"})]
 
 
-@click.command(
-    cls=Variadic,
-    epilog="Example: jbrep evaluate --encoder dae-8 encoders/face/pca-8.safetensors "
-    "--data data/face",
-)
-@click.option(
-    "--encoder",
-    shell_complete=complete_encoder,
-    required=True,
-    multiple=True,
-    help="Files, names that ship, or code, mymodule:MyEncoder; one or several.",
-)
-@data_option
-@click.option(
-    "--out",
-    type=PATH,
-    help="A folder for evaluation.json and figures.  [default: evaluation/DATA/ENCODERS]",
-)
-@click.option(
-    "--policy",
-    help="A policy that does the task well: a run's folder, or a policy by name. By default the "
-    "task's hand-written policy, if it has one.",
-)
-@click.option(
-    "--truth",
-    type=PATH,
-    help="The data set that DATA was derived from with --hide: how well an encoder estimates what "
-    "isn't seen.",
-)
-@click.option(
-    "--all",
-    "everything",
-    is_flag=True,
-    help="Show all other diagnostics, too; evaluation.json always has them.",
-)
-@import_option
-@as_json
+@command("evaluate --encoder dae-8 encoders/face/pca-8.safetensors --data data/face")
 def evaluate(
-    encoder: tuple[str, ...],
+    encoders: Annotated[Sequence[str], Meta(extra={"is_code": True, "option": "encoder"})],
     data: Path,
-    out: Path | None,
-    policy: str | None,
-    truth: Path | None,
-    everything: bool,
-    as_json: bool,
+    *,
+    out: Path | None = None,
+    everything: Annotated[bool, Meta(extra={"option": "all"})] = False,
+    as_json: AsJson = False,
+    **options: Annotated[Any, api.evaluate],
 ) -> None:
     """Show which encoders serve, and what each lacks.
 
@@ -84,84 +41,88 @@ def evaluate(
     of a good policy's value and action, linear and nonlinear probes, reconstruction, the latent's
     units, and the prediction of the next latent. An encoder of your own is code such as
     mymodule:MyEncoder; its module is imported, which runs it.
+
+    Args:
+        encoders: files, names that ship, or code, mymodule:MyEncoder; one or several.
+        data: a folder from jbrep collect.
+        out: a folder for evaluation.json and figures; by default evaluation/DATA/ENCODERS.
+        everything: show all other diagnostics, too; evaluation.json always has them.
     """
-    from jbrep import api
     from jbrep.dataset import Dataset
     from jbrep.encoders.shipped import check_found, find_all, source_of
-    from jbrep.envs.names import import_code
 
     whole = Dataset(data)
-    for name in encoder:
-        import_code(name)
+    for name in encoders:
         check_found(name, whole.task)
     from jbrep.evaluate.evaluation import EVALUATION  # imports torch
     from jbrep.report.evaluation import evaluation_text
     from jbrep.report.figures import encoder_plots
     from jbrep.report.figures import write as write_plots
 
-    encoders = find_all(encoder, whole.task)
+    found = find_all(encoders, whole.task)
     sources = {
-        label: source_of(name, whole.task) for label, name in zip(encoders, encoder, strict=True)
+        label: source_of(name, whole.task) for label, name in zip(found, encoders, strict=True)
     }
-    out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(encoders))[:_LETTERS])
+    out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(found))[:_LETTERS])
     with stoppable("the same command starts over"):
-        evaluation = api.evaluate(encoders, whole, out, policy=policy, truth=truth).evaluation
+        evaluation = api.evaluate(found, whole, out, **options).evaluation
         pictures = write_plots(encoder_plots(evaluation), out)
-    width = terminal_width()
-    notes = [wrapped(printable(note), width) for note in _notes(encoders, sources, evaluation)]
     if as_json:
-        click.echo("\n".join(notes), err=True)
-        return echo_json(evaluation.as_json())
-    click.echo(evaluation_text(evaluation, width, everything) + "\n")
-    click.echo("\n".join(notes))
-    click.echo()
-    say(str(out / EVALUATION))
+        _tell_notes(found, sources, evaluation, err=True)
+        return say_json(evaluation.as_json())
+    say(evaluation_text(evaluation, terminal_width(), everything) + "\n")
+    _tell_notes(found, sources, evaluation)
+    say(f"\n{out / EVALUATION}")
     more = "" if everything else " --all shows more."
-    return click.echo(f"Beside it: {len(pictures)} figures.{more}")
+    return say(f"Beside it: {len(pictures)} figures.{more}")
 
 
-def _notes(
-    encoders: "Mapping[str, BaseEncoder]", sources: Mapping[str, str], evaluation: "Evaluation"
-) -> list[str]:
-    """Where encoders come from, and which may have seen the episodes that they were judged on."""
+def _tell_notes(
+    encoders: "Mapping[str, BaseEncoder]",
+    sources: Mapping[str, str],
+    evaluation: "Evaluation",
+    err: bool = False,
+) -> None:
+    """Say where encoders come from, and which may have seen what they were judged on."""
     taken = []
     for label, source in sources.items():
         line = source if source.startswith(label) else f"{label}: {source}"
         arguments = ", ".join(encoders[label].task.given_arguments)
         taken.append(f"{line}, made with {arguments}" if arguments else line)
-    notes = [f"Judged: {'; '.join(taken)}."]
+    tell(f"Judged: {'; '.join(taken)}.", err)
     if maybe := [label for label, seen in evaluation.seen.items() if seen == "maybe"]:
-        notes.append(
+        tell(
             f"Perhaps not new to these episodes: {', '.join(maybe)}, whose training data has the "
-            "same seed or isn't known."
+            "same seed or isn't known.",
+            err,
         )
-    return notes
 
 
-@click.group(epilog="Example: jbrep encoder list")
-def encoder() -> None:
-    """Look at encoders, export and import them."""
+_COLUMNS = {  # by the names of diagnostics, those of the columns
+    **{name: name for name in ("forward", "rewarded", "reward", "value", "action")},
+    "times_pca": "error",
+}
+_LEGEND = {
+    "l": "size of the code",
+    "forward": "R² of the features' change over 10 steps",
+    "rewarded": "the same of what the reward depends on",
+    "reward": "R² of the mean reward of 10 steps",
+    "value": "R² of a good policy's return to go",
+    "action": "R² of a good policy's action",
+    "error": "squared error of the reconstruction, as a multiple of PCA's",
+}
 
 
-_COLUMNS = {name: name for name in ("forward", "rewarded", "reward", "value", "action")}
-_COLUMNS["times_pca"] = "error"
-
-
-@encoder.command("list", epilog="Example: jbrep encoder list --task face_direction")
-@click.option(
-    "--task",
-    shell_complete=complete_task,
-    help="One of the Jitterbug's; all of them by default.",
-)
-@as_json
-def list_shipped(task: str | None, as_json: bool) -> None:
+@command("encoder list --task face_direction")
+def list_shipped(*, task: TaskName = None, as_json: AsJson = False) -> None:
     """Show which encoders ship, and how they were judged.
 
     A dash stands for what isn't known; jbrep evaluate finds out.
+
+    Args:
+        task: one of the Jitterbug's; all of them by default.
     """
-    from jbrep.evaluate.table import SCALARS
     from jbrep.jitterbug.tasks import TASKS
-    from jbrep.methods.registry import METHODS
 
     if task is not None and task not in TASKS:
         raise InputError(f"no encoder ships for {task}: only for {', '.join(TASKS)}")
@@ -169,22 +130,17 @@ def list_shipped(task: str | None, as_json: bool) -> None:
         name: _with_diagnostics(TASKS[name].describe()) for name in ([task] if task else TASKS)
     }
     if as_json:
-        return echo_json(
-            {name: [_plain(*each) for each in encoders] for name, encoders in listed.items()}
-        )
+        plain = {name: [_plain(*each) for each in some] for name, some in listed.items()}
+        return say_json(plain)
     width = terminal_width()
     for name, encoders in listed.items():
         rows = [
             (called, str(each.latent_size), *(r2_text(known.get(column)) for column in _COLUMNS))
             for called, each, known in encoders
         ]
-        click.echo(f"{name}\n{table(('encoder', 'l', *_COLUMNS.values()), rows, width)}\n")
-    kinds = dict.fromkeys(each.kind for encoders in listed.values() for _, each, _ in encoders)
-    words = {kind: METHODS[kind].words() for kind in kinds}
-    columns = {title: SCALARS[name].words for name, title in _COLUMNS.items()}
-    columns["error"] = "squared error of the reconstruction, as a multiple of PCA's"
-    click.echo(f"columns\n{facts({'l': 'size of the code', **columns}, width)}\n")
-    return click.echo(f"kinds of encoders\n{facts(words, width)}")
+        say(f"{name}\n{table(('encoder', 'l', *_COLUMNS.values()), rows, width)}\n")
+    say(f"columns\n{facts(_LEGEND, width)}\n")
+    return tell("What the kinds of encoders are, jbrep train-encoder --help says.")
 
 
 def _plain(name: str, encoder: "Encoder", known: "Values") -> dict[str, Any]:
@@ -209,15 +165,8 @@ def _with_diagnostics(task: "Task") -> "list[tuple[str, Encoder, Values]]":
     return [(name, each, known.get(each.fingerprint, {})) for name, each in shipped(task).items()]
 
 
-_which = click.argument("encoder", shell_complete=complete_encoder)
-
-
-@encoder.command(epilog="Example: jbrep encoder info dae-8 --task face_direction")
-@_which
-@task_option
-@environment_options
-@as_json
-def info(encoder: str, as_json: bool, **options: Any) -> None:
+@command("encoder info dae-8 --task face_direction")
+def info(encoder: _Which, /, *, task: OptionalTask = None, as_json: AsJson = False) -> None:
     """Show what an encoder is and where it comes from.
 
     ENCODER is a file, or, given its --task, the name of one that ships, or code such as
@@ -225,37 +174,27 @@ def info(encoder: str, as_json: bool, **options: Any) -> None:
     """
     from jbrep.encoders.card import card, describe
     from jbrep.encoders.shipped import find_alone, source_of
-    from jbrep.envs.names import import_code
 
-    import_code(encoder)
-    task = given_task(options)
     shown, source = find_alone(encoder, task), source_of(encoder, task)
     if as_json:
-        return echo_json(describe(shown, source))
-    echo_text(card(shown, source, terminal_width()))
-    return None
+        return say_json(describe(shown, source))
+    return say(card(shown, source, terminal_width()))
 
 
-@encoder.command(
-    epilog="Example: jbrep encoder export dae-8 --task face_direction --out dae-8.onnx"
-)
-@_which
-@task_option
-@click.option("--out", required=True, type=PATH, help="A new .onnx file.")
-@environment_options
-def export(encoder: str, out: Path, **options: Any) -> None:
+@command("encoder export dae-8 --task face_direction --out dae-8.onnx")
+def export(encoder: _Which, /, out: Path, *, task: OptionalTask = None) -> None:
     """Write an encoder, with its decoder, as ONNX.
 
     The input is `observation`, in physical units; the outputs are `latent` and, if there is a
-    decoder, `reconstruction`. ENCODER is as for `info`.
+    decoder, `reconstruction`. ENCODER is as for jbrep encoder info.
+
+    Args:
+        out: a new .onnx file.
     """
     from jbrep.encoders import Encoder
     from jbrep.encoders.onnx import export as run
     from jbrep.encoders.shipped import find_alone, source_of
-    from jbrep.envs.names import import_code
 
-    import_code(encoder)
-    task = given_task(options)
     exported = find_alone(encoder, task)
     if not isinstance(exported, Encoder):
         raise InputError(
@@ -264,40 +203,36 @@ def export(encoder: str, out: Path, **options: Any) -> None:
         )
     run(exported, out)
     say(f"exported {source_of(encoder, task)}")
-    click.echo(f"open it with onnxruntime.InferenceSession({str(out)!r})")
+    say(f"open it with onnxruntime.InferenceSession({str(out)!r})")
 
 
-@encoder.command(
-    "import",
-    epilog="Example: jbrep encoder import model.onnx --task face_direction "
-    "--out encoders/mine.safetensors",
-)
-@click.argument("model", type=PATH)
-@needed_task_option
-@click.option(
-    "--decoder",
-    type=PATH,
-    help="A model from latents back to observations, if MODEL has no reconstruction.",
-)
-@click.option("--name", help="What tables will call it; by default the name of the file.")
-@click.option("--out", required=True, type=PATH, help="A new encoder file.")
-@environment_options
+@command("encoder import model.onnx --task face_direction --out encoders/mine.safetensors")
 def import_model(
-    model: Path, decoder: Path | None, name: str | None, out: Path, **options: Any
+    model: Path,
+    /,
+    task: NeededTask,
+    out: Path,
+    *,
+    decoder: Path | None = None,
+    name: str = "",
 ) -> None:
     """Make an encoder file from an ONNX model.
 
     MODEL takes observations in physical units, (rows, features), and gives codes. It may be any
     graph; onnxruntime runs it.
+
+    Args:
+        out: a new encoder file.
+        decoder: a model from latents back to observations, if MODEL has no reconstruction.
+        name: what tables will call it; by default the name of the file.
     """
     from jbrep.encoders.card import card
     from jbrep.encoders.encoder import Encoder
     from jbrep.encoders.file import SUFFIX, save_new
     from jbrep.records.storage import exists, taken
 
-    task = needed_task(options)
     if exists(out):
         raise taken(out)
     made = Encoder.from_onnx(model, task, decoder, name or out.name.removesuffix(SUFFIX))
     save_new(made, out)
-    echo_text(card(made, str(out), terminal_width()))
+    say(card(made, str(out), terminal_width()))

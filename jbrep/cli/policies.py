@@ -1,26 +1,28 @@
-"""What policies do."""
+"""What policies do, and taking one out for a robot."""
 
+import shlex
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
-import click
+from msgspec import Meta
 
-from jbrep.cli.base import PATH, POSITIVE, as_json
-from jbrep.cli.completion import complete_encoder
-from jbrep.cli.environment import (
-    environment_options,
-    given_task,
-    retries_option,
-    task_option,
-    threads_option,
-)
-from jbrep.cli.output import echo_json, echo_paths, say, tell
+from jbrep.cli.base import command, say, say_json, tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
+from jbrep.parameters import (
+    AsJson,
+    Episodes,
+    NewFile,
+    OptionalTask,
+    Retries,
+    TaskName,
+    Threads,
+    described,
+)
 from jbrep.records.record import to_plain
-from jbrep.text import counted, interval_of, percentiles, table, terminal_width
+from jbrep.text import counted, interval_of, percentiles, returns_text, table, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.envs.infos import Numbers
@@ -28,61 +30,142 @@ if TYPE_CHECKING:
     from jbrep.play.player import Player
 
 _TASK = "face_direction"
+_MAYBE = {"is_flag": False, "flag_value": ""}  # an option that may have no value
 
 
-@click.command(epilog="Example: jbrep evaluate-policy runs/a --episodes 100")
-@click.argument("policy")
-@click.option(
-    "--episodes", default=20, show_default=True, type=POSITIVE, help="How many, the same each time."
-)
-@click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
-@task_option
-@threads_option
-@retries_option
-@click.option("--algorithm", help="Of a zip file.  [default: sac]")
-@click.option(
-    "--vecnormalize",
-    type=PATH,
-    metavar="FILE",
-    help="What VecNormalize.save wrote, if a zip file's agent was trained behind that.",
-)
-@click.option(
-    "--encoder",
-    shell_complete=complete_encoder,
-    help="What a zip file was trained on, or what a policy by name observes through: a file, the "
-    "name of one that ships, or code, mymodule:MyEncoder; of a run that was made with code, that.",
-)
-@click.option(
-    "--perturb",
-    "perturbations",
-    multiple=True,
-    is_flag=False,
-    flag_value="",
-    metavar="[NAME=VALUE]",
-    help="Play the episodes undisturbed, then with noise, delays, other bodies, pushes, ...: all "
-    "that there can be, or what is named, as in --perturb delay=2 or noise=0.1,delay=1..3; may be "
-    "repeated.",
-)
-@click.option("--out", type=PATH, help="A new JSON file for the table of --perturb.")
-@environment_options
-@as_json
-@click.pass_context
-def evaluate_policy(
-    context: click.Context,
-    /,
+@command("policies")
+def policies(*, as_json: AsJson = False) -> None:
+    """Show the trained policies that ship.
+
+    Every command that takes a policy knows the one for its --task as trained, as in jbrep render
+    trained --task face_direction --out walk.mp4.
+    """
+    from jbrep.rl.shipped import SHIPPED, shipped
+
+    ships = shipped()
+    if as_json:
+        return say_json(
+            {
+                policy.task: {
+                    "observes": policy.observes,
+                    "learner": policy.learner,
+                    "steps": policy.steps,
+                    "episodes": len(policy.returns[SHIPPED]),
+                    **{name: percentiles(each) for name, each in policy.returns.items()},
+                }
+                for policy in ships
+            }
+        )
+    rows = [
+        (task, observes, learner, f"{steps:,}", *map(interval_of, returns.values()))
+        for task, observes, learner, steps, returns in ships
+    ]
+    header = ("task", "observes", "learned by", "steps", *ships[0].returns)
+    say(table(header, rows, terminal_width()))
+    episodes = len(ships[0].returns[SHIPPED])
+    say(f"\nreturns: median [10 %, 90 %] of the same {episodes} episodes")
+    return tell("falling: the preset wide, but with a learning rate that falls to 0")
+
+
+@command("policy export runs/a --out controller.onnx")
+def export(
     policy: str,
-    episodes: int,
-    threads: int | None,
-    retries: int,
-    trust: bool,
-    algorithm: str | None,
-    vecnormalize: Path | None,
-    encoder: str | None,
-    perturbations: tuple[str, ...],
-    out: Path | None,
-    as_json: bool,
-    **options: Any,
+    /,
+    out: NewFile,
+    *,
+    task: TaskName = None,
+    form: Annotated[str, Meta(extra={"option": "format"})] = "onnx",
 ) -> None:
+    """Write a policy as one model, from raw observations to actions.
+
+    POLICY is the folder of a run, a policy's file, or trained, which ships and needs a --task.
+    Scaling, encoder, running normalisation, network and bounds are all in the model; names, units,
+    ranges and the rate are in its metadata. Each action is to be held for as many control steps as
+    the run's action_repeat says.
+
+    Args:
+        form: either onnx, or torch for a program of torch.export.
+    """
+    from jbrep.envs.description import describe
+    from jbrep.envs.names import modules_of
+    from jbrep.play.sources import policy_file
+    from jbrep.rl.controller import load_policy
+    from jbrep.rl.export import described
+    from jbrep.rl.export import export as write
+    from jbrep.rl.shipped import SHIPPED
+
+    if task and policy != SHIPPED:
+        raise InputError(
+            f"--task goes with {SHIPPED}, the policy that ships for it; {policy} must be a run's "
+            "folder or a policy's file, which say their own: leave out --task"
+        )
+    controller = load_policy(policy_file(policy, describe(task) if task else None))
+    write(controller, out, form)
+    said, own = described(controller), controller.task
+    rate = "" if said["rate"] is None else f", {said['rate']:g} times a second"
+    say(f"{out}: {own.size} numbers of {own.name} to {own.action_size}{rate}")
+    if form == "onnx":
+        modules = [f"--import={module}" for module in modules_of(own)]
+        check = ["jbrep", "policy", "check", str(out), "--run", policy, *modules]
+        say(f"check it with {shlex.join(check + (['--task', task] if task else []))}")
+    else:
+        say(f"open it with torch.export.load({str(out)!r}).module()")
+
+
+@command("policy check controller.onnx --run runs/a")
+def check(
+    model: Path,
+    /,
+    *,
+    run: str | None = None,
+    episodes: Episodes = 20,
+    threads: Threads = None,
+    retries: Retries = 0,
+    task: OptionalTask = None,
+) -> None:
+    """Play an exported policy in its environment.
+
+    MODEL is an ONNX file that jbrep policy export wrote. It plays the episodes that every run is
+    evaluated on; with `run`, that run plays the same ones.
+
+    Args:
+        run: the run that it was exported from, or trained, to play beside it.
+    """
+    import numpy as np
+
+    from jbrep.play.exported import exported_player
+    from jbrep.play.sources import find_player
+
+    beside = find_player(run, task) if run else None
+    player = exported_player(model, beside.task if beside else task)
+    returns = player.returns(episodes, threads, retries)
+    say(f"{player.task.name}, {model}: {returns_text(returns)}")
+    if beside:
+        theirs = beside.returns(episodes, threads, retries)
+        apart = float(np.abs(returns - theirs).max())
+        said = f"{beside.name}: {interval_of(theirs)}"
+        say(f"{said}; no episode's return differs by more than {apart:.3g}")
+
+
+@command("evaluate-policy runs/a --episodes 100")
+def evaluate_policy(
+    policy: str,
+    /,
+    *,
+    episodes: Episodes = 20,
+    trust: bool = False,
+    threads: Threads = None,
+    retries: Retries = 0,
+    algorithm: Annotated[str, Meta(extra={"default": "sac"})] = "",
+    vecnormalize: Annotated[Path | None, Meta(extra={"metavar": "FILE"})] = None,
+    encoder: Annotated[str | None, Meta(extra={"is_code": True})] = None,
+    perturb: Annotated[
+        Sequence[str], Meta(extra={"metavar": "[NAME=VALUE]", "click": _MAYBE})
+    ] = (),
+    out: Path | None = None,
+    as_json: AsJson = False,
+    **options: Annotated[Any, described],
+) -> bool:
     """Show the returns of a policy.
 
     POLICY is a folder of jbrep rl, a zip file that stable-baselines3 wrote, or a policy by its
@@ -96,27 +179,47 @@ def evaluate_policy(
 
     With --perturb they are a table: how much of its return a policy keeps where sensors are noisy
     or late, readings are lost, the body or the physics is another, or the robot is pushed.
+
+    Args:
+        trust: read a zip file from elsewhere, which can run code.
+        algorithm: of a zip file.
+        vecnormalize: what VecNormalize.save wrote, if a zip file's agent was trained behind that.
+        encoder: what a zip file was trained on, or what a policy by name observes through: a file,
+            the name of one that ships, or code, mymodule:MyEncoder; of a run that was made with
+            code, that.
+        perturb: play the episodes undisturbed, then with noise, delays, other bodies, pushes, ...:
+            all that there can be, or what is named, as in --perturb delay=2 or
+            noise=0.1,delay=1..3; may be repeated.
+        out: a new JSON file for the table of `perturb`.
     """
     from jbrep.encoders.shipped import source_of
-    from jbrep.envs.names import import_code
+    from jbrep.envs.infos import Numbers
+    from jbrep.envs.lanes import EnvironmentFailedError
     from jbrep.play.sources import is_by_name
 
-    import_code(encoder)
-    _check_perturbations(perturbations, out)
-    zip_file = _Zip(algorithm, trust, vecnormalize)
+    _check_perturbations(perturb, out)
     if is_by_name(policy):
-        options["task"] = options["task"] or _TASK
-    player = _find(policy, given_task(options), encoder, zip_file)
+        options.setdefault("task", _TASK)
+    of_zip = {"algorithm": algorithm, "trust": trust, "vecnormalize": vecnormalize}
+    player = _find(policy, described(**options), encoder, **of_zip)
     source = None if encoder is None else source_of(encoder, player.task)
-    if perturbations:
-        chosen = [each for each in perturbations if each]
-        return _perturb(policy, player, chosen, (episodes, threads, retries), out, as_json)
-    returns, numbers, failure = _outcome(player, episodes, threads, retries)
+    if perturb:
+        chosen = [each for each in perturb if each]
+        _perturb(policy, player, chosen, (episodes, threads, retries), out, as_json)
+        return False
+    returns, numbers, failure = list[float](), list[Numbers](), ""
+    try:
+        for some in player.outcomes_in_turn(episodes, threads, retries):
+            returns += some.returns.tolist()
+            numbers += some.numbers
+    except EnvironmentFailedError as error:
+        if not returns:
+            raise
+        failure = str(error)
     _show_returns(policy, player, source, returns, numbers, as_json)
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
-        context.exit(1)
-    return None
+    return bool(failure)
 
 
 def _show_returns(
@@ -130,7 +233,7 @@ def _show_returns(
     from jbrep.envs.infos import by_name, shares_text
 
     if as_json:
-        return echo_json(
+        return say_json(
             {
                 "policy": policy,
                 "task": player.task.name,
@@ -152,7 +255,7 @@ def _show_returns(
     return None
 
 
-def _check_perturbations(perturbations: tuple[str, ...], out: Path | None) -> None:
+def _check_perturbations(perturbations: Sequence[str], out: Path | None) -> None:
     from jbrep.play.perturbed import read_perturbation
     from jbrep.records.storage import exists, taken
 
@@ -202,37 +305,14 @@ def _perturb(
             if not as_json:
                 say(_line(row.cells, left))
     if as_json:
-        echo_json(to_plain(result))
+        say_json(to_plain(result))
     elif out:
-        echo_paths([out])
+        say(f"\n{out}")
 
 
 def _line(cells: Sequence[str], left: int) -> str:
     first, *others = cells
     return "  ".join((first.ljust(left), *(cell.rjust(25) for cell in others)))
-
-
-def _outcome(
-    player: "Player", episodes: int, threads: int | None, retries: int
-) -> tuple[list[float], "list[Numbers]", str]:
-    """The returns and infos of the episodes that were finished, and why others weren't.
-
-    Raises:
-        EnvironmentFailedError: none was.
-    """
-    from jbrep.envs.lanes import EnvironmentFailedError
-
-    returns: list[float] = []
-    numbers: list[Numbers] = []
-    try:
-        for some in player.outcomes_in_turn(episodes, threads, retries):
-            returns += some.returns.tolist()
-            numbers += some.numbers
-    except EnvironmentFailedError as error:
-        if not returns:
-            raise
-        return returns, numbers, str(error)
-    return returns, numbers, ""
 
 
 def _title(policy: str, player: "Player") -> str:
@@ -245,36 +325,17 @@ def _title(policy: str, player: "Player") -> str:
     return f"{player.task.name} on {player.representation}{step}"
 
 
-class _Zip(NamedTuple):
-    """What is said of a zip file."""
-
-    algorithm: str | None
-    trust: bool
-    vecnormalize: Path | None
-
-    def player(self, path: Path, task: "Task | None", encoder: str | None) -> "Player":
-        """The policy in it; what it doesn't tell is noted."""
-        from jbrep.play.sources import as_player
-        from jbrep.rl.from_zip import load_zip  # imports torch
-
-        algorithm = self.algorithm or "sac"
-        found = load_zip(path, task, algorithm, encoder, self.trust, self.vecnormalize)
-        if found.note:
-            say(f"note: {found.note}", err=True)
-        return as_player(str(path), found.trained, task)
-
-
-def _find(policy: str, task: "Task | None", encoder: str | None, zip_file: _Zip) -> "Player":
-    """The policy of a run, by name, or in a zip file."""
+def _find(policy: str, task: "Task | None", encoder: str | None, **of_zip: Any) -> "Player":
+    """The policy of a run, by name, or in a zip file, which options are about."""
     from jbrep.encoders import find
     from jbrep.play import sources
 
     path, folder = Path(policy), sources.run_folder(policy)
-    is_folder = path.is_dir()
-    is_zip = not (sources.is_by_name(policy) or sources.is_trained(policy) or is_folder)
-    if not is_zip and (unused := [name for name, given in zip_file._asdict().items() if given]):
+    is_run = sources.is_trained(policy) or path.is_dir()
+    is_zip = not (is_run or sources.is_by_name(policy))
+    if not is_zip and (unused := [name for name, given in of_zip.items() if given]):
         raise InputError(f"--{unused[0]} is for zip files from elsewhere: leave it out")
-    if sources.is_trained(policy) or is_folder:
+    if is_run:
         if encoder and not (folder and encoder == _code_of(folder)):
             raise InputError(
                 f"{policy} is a trained policy, which has its own encoder: leave out --encoder"
@@ -288,7 +349,13 @@ def _find(policy: str, task: "Task | None", encoder: str | None, zip_file: _Zip)
             f"no policy at {policy}: a folder of jbrep rl is needed, a zip file of "
             f"stable-baselines3, or a name: {sources.policy_names()}"
         )
-    return zip_file.player(path, task, encoder)
+    from jbrep.rl.from_zip import load_zip  # imports torch
+
+    algorithm = of_zip.pop("algorithm") or "sac"
+    found = load_zip(path, task, algorithm, encoder, **of_zip)
+    if found.note:
+        say(f"note: {found.note}", err=True)
+    return sources.as_player(policy, found.trained, task)
 
 
 def _code_of(folder: Path) -> str | None:
@@ -296,38 +363,3 @@ def _code_of(folder: Path) -> str | None:
     from jbrep.rl.checkpoint import run_settings  # imports torch
 
     return run_settings(folder).encoder_code
-
-
-@click.command(epilog="Example: jbrep policies")
-@as_json
-def policies(as_json: bool) -> None:
-    """Show the trained policies that ship.
-
-    Every command that takes a policy knows the one for its --task as trained, as in jbrep render
-    trained --task face_direction --out walk.mp4.
-    """
-    from jbrep.rl.shipped import SHIPPED, shipped
-
-    ships = shipped()
-    if as_json:
-        return echo_json(
-            {
-                policy.task: {
-                    "observes": policy.observes,
-                    "learner": policy.learner,
-                    "steps": policy.steps,
-                    "episodes": len(policy.returns[SHIPPED]),
-                    **{name: percentiles(each) for name, each in policy.returns.items()},
-                }
-                for policy in ships
-            }
-        )
-    rows = [
-        (task, observes, learner, f"{steps:,}", *map(interval_of, returns.values()))
-        for task, observes, learner, steps, returns in ships
-    ]
-    header = ("task", "observes", "learned by", "steps", *ships[0].returns)
-    click.echo(table(header, rows, terminal_width()))
-    episodes = len(ships[0].returns[SHIPPED])
-    click.echo(f"\nreturns: median [10 %, 90 %] of the same {episodes} episodes")
-    return tell("falling: the preset wide, but with a learning rate that falls to 0")

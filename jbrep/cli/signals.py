@@ -69,15 +69,3 @@ def stop_signals() -> Iterator[list[int]]:
 
     with on_stop(receive):
         yield received
-
-
-@contextmanager
-def deferred_stop() -> Iterator[None]:
-    """Deliver Ctrl-C and SIGTERM at the end: an extension module turns them into ImportError."""
-    pending: list[int] = []
-    try:
-        with on_stop(lambda number, frame: pending.append(number)):
-            yield
-    finally:
-        if pending:
-            signal.raise_signal(pending[0])

@@ -1,14 +1,15 @@
 """Studies: many agents, and what the statistics say of them."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
-import click
+from msgspec import Meta
 
-from jbrep.cli.base import PATH, RESUMES, as_json
-from jbrep.cli.environment import import_option
-from jbrep.cli.output import echo_json, echo_paths, echo_text, say, tell
+from jbrep import api
+from jbrep.cli.base import RESUMES, command, say, say_json, tell
 from jbrep.cli.signals import stoppable
+from jbrep.errors import InputError, choose
+from jbrep.parameters import AsJson, Backend, Workers
 from jbrep.text import Table, duration, terminal_width
 
 if TYPE_CHECKING:
@@ -17,50 +18,31 @@ if TYPE_CHECKING:
     from jbrep.stats.rules import Planned
     from jbrep.study.forecast import Forecast
 
-_COUNT = click.IntRange(1, 1024)
 
-
-@click.command(epilog="Example: jbrep study studies/demo.toml --out runs/demo")
-@click.argument("study", type=PATH)
-@click.option("--out", type=PATH, help="A folder.  [default: runs/NAME of the STUDY]")
-@click.option(
-    "--workers",
-    type=_COUNT,
-    help="Processes at a time.  [default: one for each core; one if it learns on a GPU]",
-)
-@click.option(
-    "--backend",
-    default="local",
-    show_default=True,
-    help="local, for this machine, or ray, for the cluster that RAY_ADDRESS names.",
-)
-@click.option("--dry-run", is_flag=True, help="List the runs and estimate the time.")
-@click.option(
-    "--register",
-    is_flag=True,
-    help="Write down the plan beside STUDY, with the hashes of what is there and the code's "
-    "version, before the first run.",
-)
-@import_option
-@click.pass_context
+@command("study studies/demo.toml --out runs/demo")
 def study(
-    context: click.Context,
-    /,
     study: Path,
-    out: Path | None,
-    workers: int | None,
-    backend: str,
-    dry_run: bool,
-    register: bool,
-) -> None:
+    /,
+    *,
+    out: Path | None = None,
+    workers: Workers = None,
+    backend: Backend = "local",
+    dry_run: bool = False,
+    register: bool = False,
+) -> bool:
     """Train a grid of agents, and judge the claims of a study.
 
     STUDY is a TOML file of tasks, algorithms, representations and seeds, such as those in studies/.
     Tasks are the Jitterbug's, by their names, and any environments, by their Gymnasium ids.
     One with claims is registered first, in a commit; then data sets and encoders are made. Stopped
     or killed, the same command resumes the study; runs that have ended are never run again.
+
+    Args:
+        out: a folder; by default runs/NAME of the STUDY.
+        dry_run: list the runs and estimate the time.
+        register: write down the plan beside STUDY, with the hashes of what is there and the code's
+            version, before the first run.
     """
-    from jbrep.errors import InputError, choose
     from jbrep.records.storage import exists
     from jbrep.records.toml import read_toml
 
@@ -79,13 +61,11 @@ def study(
     folder = out or Path("runs") / study.stem
     if dry_run or register:
         _announce(study, folder, dry_run, workers)
-        return
-    from jbrep import api
-
+        return False
     with stoppable(RESUMES):
         made = api.study(study, folder, workers=workers, backend=backend)
     _show(made)
-    context.exit(bool(made.tables.record.missing))
+    return bool(made.tables.record.missing)
 
 
 def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> None:
@@ -99,13 +79,13 @@ def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> N
     for notice in plan.study.notices:
         tell(notice, err=True)
     if expected:
-        return click.echo(_forecast_text(expected, plan.study.planned, terminal_width()))
+        return say(_forecast_text(expected, plan.study.planned, terminal_width()))
     registered = register_study(plan)
     found = registration_in(registered)
-    click.echo(f"registered on {found.date} (SHA-256 {found.sha256})")
+    say(f"registered on {found.date} (SHA-256 {found.sha256})")
     if plan.in_git:
         tell(f"Commit {registered.name}, then run the study: before, it is refused.", err=True)
-    return echo_paths([registered])
+    return say(f"\n{registered}")
 
 
 def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
@@ -148,48 +128,36 @@ def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
     return "\n\n".join(in_text(part, width) for part in parts)
 
 
-@click.command(epilog="Example: jbrep report runs/demo")
-@click.argument("folder", type=PATH)
-@click.option(
-    "--evaluation",
-    multiple=True,
-    metavar="FOLDER",
-    help="From jbrep evaluate, of encoders of these runs: its diagnostics go into the tables. "
-    "{task} in it stands for each task. May be repeated.",
-)
-@click.option("--out", type=PATH, help="A folder for it.  [default: the study's own]")
-@click.option("--all", "everything", is_flag=True, help="Print every table; the page has them.")
-@import_option
-@as_json
+@command("report runs/demo")
 def report(
     folder: Path,
-    evaluation: tuple[str, ...],
-    out: Path | None,
-    everything: bool,
-    as_json: bool,
+    /,
+    *,
+    everything: Annotated[bool, Meta(extra={"option": "all"})] = False,
+    as_json: AsJson = False,
+    **options: Annotated[Any, api.report],
 ) -> None:
     """Say what a study found, and write a page of it.
 
     FOLDER holds a study, finished or not, or any runs. Where there are no runs, as in
     results/confirm, the report is made from the tables alone.
-    """
-    from jbrep import api
 
-    made = api.report(folder, evaluation=evaluation, out=out)
-    _show(made, everything, as_json)
+    Args:
+        everything: print every table; the page has them.
+    """
+    _show(api.report(folder, **options), everything, as_json)
 
 
 def _show(made: "Report", everything: bool = False, as_json: bool = False) -> None:
     from jbrep.report.report import results_text
 
     if not as_json:
-        echo_text(results_text(made.findings, terminal_width(), everything))
+        say(results_text(made.findings, terminal_width(), everything))
     for line in made.notes:
         say(line, err=True)
     if as_json:
-        return echo_json(made.findings.as_json())
+        return say_json(made.findings.as_json())
     beside = ", ".join(path.name for path in made.paths if path != made.page)
     more = "" if everything else " --all prints every table."
-    click.echo()
-    say(str(made.page))
+    say(f"\n{made.page}")
     return tell(f"Beside it: {beside}.{more}")

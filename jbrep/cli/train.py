@@ -1,18 +1,16 @@
 """Making encoders, with options from the settings of the methods."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 from msgspec import inspect
 
-from jbrep.cli.base import PATH, POSITIVE, RESUMES, Variadic, data_option, with_options
-from jbrep.cli.completion import complete_kind
-from jbrep.cli.environment import import_option
-from jbrep.cli.output import tell
+from jbrep import api
+from jbrep.cli.base import RESUMES, command, tell
+from jbrep.cli.generator import Command
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError, choose
 from jbrep.methods.kinds import KINDS
@@ -25,7 +23,7 @@ if TYPE_CHECKING:
 _FEW = 3  # kinds: where only so many don't take a setting, help names those
 
 
-class _Making(Variadic):
+class _Making(Command):
     """A command with an option for each setting of the methods that it offers."""
 
     kinds: tuple[str, ...] = ()  # all of them if empty
@@ -37,10 +35,9 @@ class _Making(Variadic):
                 choose(value, KINDS, "kind")
         return super().parse_args(ctx, args)
 
-    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        """The command's own options, those of its methods, and --help."""
-        *own, last = super().get_params(ctx)
-        return [*own, *self._settings, last]
+    def options(self) -> list[click.Parameter]:
+        own = [each for each in super().options() if each.name != "latent"]
+        return [*own, *self._settings]
 
     @cached_property
     def _methods(self) -> "dict[str, type[Method]]":
@@ -85,21 +82,20 @@ class _Making(Variadic):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the command's options, the kinds, and the settings."""
-        own = [each for each in self.get_params(ctx) if each not in self._settings]
+
+        def told(options: Iterable[click.Parameter]) -> list[tuple[str, str]]:
+            return [record for each in options if (record := each.get_help_record(ctx))]
+
         sections = {
-            "Options": _help_of(own, ctx),
+            "Options": told(p for p in self.get_params(ctx) if p not in self._settings),
             "Kinds": [(kind, method.words()) for kind, method in self._methods.items()],
-            "Settings": _help_of(self._settings, ctx),
+            "Settings": told(self._settings),
         }
         if len(self._methods) == 1:
             del sections["Kinds"]
         for title, rows in sections.items():
             with formatter.section(title):
                 formatter.write_dl(rows)
-
-
-def _help_of(options: Sequence[click.Parameter], ctx: click.Context) -> list[tuple[str, str]]:
-    return [record for each in options if (record := each.get_help_record(ctx))]
 
 
 def _shown(key: Key) -> str:
@@ -109,17 +105,14 @@ def _shown(key: Key) -> str:
     return "" if key.default is False else key.default_shown
 
 
-def _given(kind: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a method that options give, as text; sizes of the latent as a list."""
+def _read(kind: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options with settings of a method as it reads them: text; sizes of the latent as a list."""
     from jbrep.methods.registry import METHODS, get_method
 
     method = get_method(kind)
-    given = {
-        name: ",".join(value) if isinstance(value, tuple) else value
-        for name, value in options.items()
-        if value not in (None, ())
-    }
-    for name in given:
+    settings = {key.name for each in METHODS.values() for key in keys_of(each)}
+    given = {name: ",".join(v) if isinstance(v, tuple) else v for name, v in options.items()}
+    for name in settings & {*given}:
         if not method.takes(name):
             kinds = ", ".join(each for each, m in METHODS.items() if m.takes(name))
             raise InputError(
@@ -138,68 +131,30 @@ class _Dae(_Making):
     kinds = ("dae",)
 
 
-_making = with_options(
-    data_option,
-    click.option("--out", required=True, type=PATH, help="A folder for the encoder files."),
-    click.option("--name", help="What files and tables call it; by default, what it is."),
-    click.option("--device", default="auto", show_default=True, help="cpu, cuda, or auto."),
-    click.option(
-        "--seeds",
-        type=POSITIVE,
-        metavar="N",
-        help="Make N of each, of the seeds 0 to N - 1: NAME-s0, NAME-s1, ...",
-    ),
-    click.option("--preset", help="Named settings; of dae: authors, its authors' own."),
-    import_option,
-)
-
-
-@click.command(
-    cls=_Dae,
-    epilog="Example: jbrep train-dae --data data/face --latent 12 8 4 --out encoders/face",
-)
-@_making
-def train_dae(**options: Any) -> None:
+@command("train-dae --data data/face --latent 12 8 4 --out encoders/face", _Dae)
+def train_dae(**options: Annotated[Any, api.train_encoders]) -> None:
     """Train denoising autoencoders.
 
     They learn from 80 % of the episodes, with the paper's settings by default, and are compared
     with PCA on the others. Ctrl-C keeps the best so far, and the same command resumes.
     """
-    _fit("dae", **options)
+    train_encoder("dae", **options)
 
 
-@click.command(
-    cls=_Making,
-    epilog="Example: jbrep train-encoder --kind slow --data data/face --latent 8 "
-    "--out encoders/face",
+@command(
+    "train-encoder --kind slow --data data/face --latent 8 --out encoders/face",
+    _Making,
 )
-@click.option("--kind", required=True, shell_complete=complete_kind, help="One of those below.")
-@_making
-def train_encoder(kind: str, **options: Any) -> None:
+def train_encoder(kind: str, **options: Annotated[Any, api.train_encoders]) -> None:
     """Make encoders of any kind.
 
     They learn from 80 % of the episodes, and say how good they are at what their kind is for. Each
     kind takes only some of the settings.
+
+    Args:
+        kind: one of those below.
     """
-    _fit(kind, **options)
-
-
-def _fit(
-    kind: str,
-    data: Path,
-    out: Path,
-    name: str | None,
-    seeds: int | None,
-    device: str,
-    preset: str | None,
-    **options: Any,
-) -> None:
-    from jbrep import api
-
-    given = _given(kind, options)
-    made = api.train_encoders(
-        data, out, kind, seeds=seeds, name=name, preset=preset, device=device, **given
-    )
-    with stoppable(f"{RESUMES}; the best so far is in {out}"):
-        for each in made:
+    given = _read(kind, options)
+    with stoppable(f"{RESUMES}; the best so far is in {given['out']}"):
+        for each in api.train_encoders(kind=kind, **given):
             tell(str(each))

@@ -37,7 +37,7 @@ class Layout(Record, frozen=True, kw_only=True):
         Meta(
             description="The reward's column; or module:function, which is run, for rewards (n,) "
             "of observations (n, d) and actions (n, k).",
-            extra={"default": "reward, if there is one"},
+            extra={"default": "reward, if there is one", "is_code": True},
         ),
     ] = ""
     time: Annotated[

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, Meta, UnsetType
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from jbrep.dataset.settings import (
@@ -18,7 +18,7 @@ from jbrep.dataset.settings import (
 )
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.records.record import to_plain
+from jbrep.records.record import pattern, to_plain
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -29,8 +29,9 @@ _EPISODE_BITS = {63: 32, 31: 20}  # of a seed, for the number of the episode
 
 _Code = Annotated[
     str,
-    Meta(
-        pattern=r"(?a)\A[\w.]+:[\w.]+ [0-9a-f]{12}\Z",
+    pattern(
+        r"(?a)\A[\w.]+:[\w.]+ [0-9a-f]{12}\Z",
+        "module:function and the first 12 digits of its hash",
         max_length=MAX_LETTERS,
     ),
 ]

@@ -16,30 +16,34 @@ MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 PolicySettings = Mapping[str, Any]  # a kind and its constants
 
 
+Steps = Annotated[
+    int, Meta(ge=1, le=10**12, description="How many; the last episode is completed.")
+]
+RootSeed = Annotated[int, Meta(ge=0, le=MAX_ROOT_SEED, description="Root of every episode's seed.")]
+ShardEpisodes = Annotated[
+    int,
+    Meta(
+        ge=1,
+        le=1_000_000,
+        description="Episodes in a shard.",
+        extra={
+            "default": "so many that a shard has 100,000 steps in a batch of the Jitterbug, "
+            "20,000 in others"
+        },
+    ),
+]
+StoreState = Annotated[
+    bool, Meta(description="Store the Jitterbug's qpos and qvel, for jbrep data derive.")
+]
+
+
 class CollectSettings(Record, frozen=True, kw_only=True):
     """How much is collected, and how it is stored."""
 
-    steps: Annotated[
-        int, Meta(ge=1, le=10**12, description="How many; the last episode is completed.")
-    ]
-    seed: Annotated[
-        int, Meta(ge=0, le=MAX_ROOT_SEED, description="Root of every episode's seed.")
-    ] = 0
-    shard_episodes: Annotated[
-        int,
-        Meta(
-            ge=1,
-            le=1_000_000,
-            description="Episodes in a shard.",
-            extra={
-                "default": "so many that a shard has 100,000 steps in a batch of the Jitterbug, "
-                "20,000 in others"
-            },
-        ),
-    ] = 100
-    store_state: Annotated[
-        bool, Meta(description="Store the Jitterbug's qpos and qvel, for jbrep data derive.")
-    ] = False
+    steps: Steps
+    seed: RootSeed = 0
+    shard_episodes: ShardEpisodes = 100
+    store_state: StoreState = False
 
 
 def parts_of(policy: PolicySettings) -> Iterator[PolicySettings]:

@@ -3,11 +3,9 @@
 import re
 from typing import Annotated, NamedTuple
 
-from msgspec import Meta
+from jbrep.records.record import converted, pattern
 
-from jbrep.records.record import converted
-
-Name = Annotated[str, Meta(pattern=r"^[a-z0-9-]+\Z")]
+Name = Annotated[str, pattern(r"^[a-z0-9-]+\Z", "small letters, digits and '-'")]
 _NAME = re.compile(r"(?P<stem>.+?)(-(?P<latent>[0-9]{1,9}))?(-s(?P<seed>[0-9]{1,9}))?", re.ASCII)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from jbrep.envs.domain import Domain
 from jbrep.errors import InputError
-from jbrep.records.record import Finite, Record, Sha256
+from jbrep.records.record import Finite, Record, Sha256, pattern
 from jbrep.text import slug
 
 Array = NDArray[np.float64]
@@ -25,13 +25,20 @@ WIDE_SEEDS: SeedBits = 63  # bits of the seeds that most environments take
 NARROW_SEEDS: SeedBits = 31  # and of those of others
 MAX_FEATURES = 4096
 _MAX_ACTIONS = 1024
+_LETTERS = "letters of ASCII, digits, '_', '-' and '.'"
 EpisodeSteps = Annotated[int, Meta(ge=1, le=MAX_EPISODE_STEPS)]
-Word = Annotated[str, Meta(pattern=r"(?a)\A[A-Za-z][\w.-]{0,99}\Z")]
-Id = Annotated[  # no part of a path leads upwards
-    str, Meta(pattern=r"(?a)\A(\w[\w-]{0,99}/)?\w[\w.-]{0,99}\Z")
+Word = Annotated[
+    str, pattern(r"(?a)\A[A-Za-z][\w.-]{0,99}\Z", f"a letter, then up to 99 {_LETTERS}")
 ]
-_Group = Annotated[str, Meta(pattern=r"(?a)\A([A-Za-z][\w.-]{0,99})?\Z")]
-_Unit = Annotated[str, Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]{0,40}\Z")]
+Id = Annotated[  # no part of a path leads upwards
+    str,
+    pattern(r"(?a)\A(\w[\w-]{0,99}/)?\w[\w.-]{0,99}\Z", "an id such as Hopper-v5 or its/Hopper-v5"),
+]
+_Group = Annotated[
+    str,
+    pattern(r"(?a)\A([A-Za-z][\w.-]{0,99})?\Z", f"empty, or a letter, then up to 99 {_LETTERS}"),
+]
+_Unit = Annotated[str, pattern(r"\A[^\x00-\x1f\x7f-\x9f]{0,40}\Z", "a line of up to 40 letters")]
 Kind = Literal["scalar", "angle", "quaternion", "vector", "offset", "point"]
 Frame = Literal["", "world", "body", "heading"]
 SPATIAL: Mapping[Kind, range] = {  # kinds of several features, a group of their own; of how many
@@ -41,8 +48,10 @@ SPATIAL: Mapping[Kind, range] = {  # kinds of several features, a group of their
     "point": range(2, 4),
 }
 _Positive = Annotated[float, Meta(gt=0, le=1e12)]
-_Part = Annotated[str, Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]{1,200}\Z")]
-Missing = Annotated[str, Meta(pattern=r"\A(skip|hold:[1-9]\d{0,5})\Z")]
+_Part = Annotated[str, pattern(r"\A[^\x00-\x1f\x7f-\x9f]{1,200}\Z", "a line of 1 to 200 letters")]
+Missing = Annotated[
+    str, pattern(r"\A(skip|hold:[1-9]\d{0,5})\Z", "skip, or hold:N with N from 1 on")
+]
 _Arrays = Mapping[Word, Annotated[int, Meta(ge=1, le=MAX_FEATURES)]]
 _Bounds = Annotated[tuple[Finite, ...], Meta(min_length=1, max_length=_MAX_ACTIONS)]
 

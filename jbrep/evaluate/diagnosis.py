@@ -21,6 +21,7 @@ from jbrep.evaluate.evaluation import EVALUATION, KEPT, Diagnostics, Evaluation,
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.prediction import prediction, problems
 from jbrep.evaluate.reconstruction import reconstruction
+from jbrep.evaluate.registry import SCALARS as SCALARS
 from jbrep.evaluate.registry import Judged, measured
 from jbrep.evaluate.regression import Networks, beside, fit
 from jbrep.machine import cores

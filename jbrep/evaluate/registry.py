@@ -43,7 +43,7 @@ class Scalar(NamedTuple):
         return known.scores.get(self.name)
 
 
-SCALARS: dict[str, Scalar] = {}  # by name; complete where jbrep.evaluate.table is imported
+SCALARS: dict[str, Scalar] = {}  # by name; complete where jbrep.evaluate.diagnosis is imported
 _REGISTERED: list[tuple[Callable[[Judged], Any], tuple[str, ...]]] = []
 _Measure = TypeVar("_Measure", bound=Callable[[Judged], Any])
 

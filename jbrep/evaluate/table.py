@@ -3,15 +3,12 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from jbrep.evaluate import control, prediction, readout, reconstruction
-from jbrep.evaluate.evaluation import Diagnostics
-from jbrep.evaluate.registry import SCALARS, Scalar
 from jbrep.records.tables import Columns, csv_text, finite, read_csv
 
-# what is imported from here registers itself in SCALARS
-__all__ = ["SCALARS", "Scalar", "control", "prediction", "readout", "reconstruction"]
+if TYPE_CHECKING:
+    from jbrep.evaluate.evaluation import Diagnostics
 
 DIAGNOSTICS = "diagnostics.csv"  # of a study, or beside encoders
 Values = Mapping[str, float | None]  # by name; None, or nothing, where it isn't known
@@ -28,7 +25,7 @@ class Diagnosed(NamedTuple):
     values: Values
 
 
-def headline(known: Diagnostics) -> dict[str, float | None]:
+def headline(known: "Diagnostics") -> dict[str, float | None]:
     """The numbers of an encoder without their intervals."""
     return {name: score.value for name, score in known.scores.items()}
 

@@ -8,13 +8,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated
 
-from msgspec import Meta
+from jbrep.records.record import pattern
 
 _SECONDS = 5
 CHANGES = "+changes"
 Commits = Mapping[
-    Annotated[str, Meta(pattern=r"\A(jbrep|work)\Z")],
-    Annotated[str, Meta(pattern=rf"\A[0-9a-f]{{40,64}}({re.escape(CHANGES)})?\Z")],
+    Annotated[str, pattern(r"\A(jbrep|work)\Z", "jbrep or work")],
+    Annotated[
+        str, pattern(rf"\A[0-9a-f]{{40,64}}({re.escape(CHANGES)})?\Z", "the hash of a commit")
+    ],
 ]
 
 

@@ -1,5 +1,6 @@
 """The keys that a record has, as its options on the command line and the docs tell of them."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import msgspec
@@ -13,19 +14,26 @@ class Key(NamedTuple):
 
     name: str  # in files
     field: str  # in Python
-    kind: inspect.Type
-    annotation: Any  # the same as Python has it
+    annotation: Any
     default: Any  # NODEFAULT: it must be given
     help: str  # what it means
-    default_in_words: str  # where the default stands for what other settings decide; often empty
+    extra: Mapping[str, Any] = {}  # what else the annotation says
+
+    @property
+    def kind(self) -> inspect.Type:
+        """Its type as msgspec has it."""
+        return type_of(self.annotation)
 
     @property
     def default_shown(self) -> str:
-        """The default for a reader; empty where there is none, or it says nothing."""
-        value = self.default
-        if self.default_in_words or value in (NODEFAULT, UNSET, None, ""):
-            return self.default_in_words
-        if isinstance(value, Record | dict | tuple | frozenset):
+        """The default for a reader; empty where there is none, or it says nothing.
+
+        An annotation says what it stands for by `Meta(extra={"default": "ten times as many"})`.
+        """
+        value, words = self.default, str(self.extra.get("default", ""))
+        if words or value in (NODEFAULT, UNSET, None, ""):
+            return words
+        if isinstance(value, Record | Mapping | tuple | frozenset):
             return ""
         if isinstance(value, bool):
             return str(value).lower()
@@ -33,28 +41,16 @@ class Key(NamedTuple):
 
 
 def keys_of(kind: type[Record]) -> list[Key]:
-    """The keys of a record, in order.
-
-    A field says what its default stands for by `Meta(extra={"default": "ten times as many"})`.
-    """
+    """The keys of a record, in order."""
     node = type_of(kind)
     assert isinstance(node, inspect.StructType)
     keys = []
     for each, field in zip(node.fields, msgspec.structs.fields(kind), strict=True):
         told = each.type if isinstance(each.type, inspect.Metadata) else None
-        words = (told and told.extra_json_schema) or {}
-        extra = (told and told.extra) or {}
-        keys.append(
-            Key(
-                each.encode_name,
-                each.name,
-                each.type,
-                field.type,
-                default_of(field),
-                words.get("description", ""),
-                str(extra.get("default", "")),
-            )
-        )
+        words, extra = (told.extra_json_schema, told.extra) if told else (None, None)
+        help_ = (words or {}).get("description", "")
+        default = default_of(field)
+        keys.append(Key(each.encode_name, each.name, field.type, default, help_, extra or {}))
     return keys
 
 

@@ -12,6 +12,7 @@ https://jcristharif.com/msgspec/constraints.html
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from decimal import Decimal
 from typing import Annotated, Any, Self, TypeVar
 
 import msgspec
@@ -24,9 +25,17 @@ from jbrep.text import printable
 _Kind = TypeVar("_Kind")
 
 MOST_WHOLE = 1 << 53  # that floats hold, as they do all whole numbers below
+_IN_WORDS = "in_words"
+
+
+def pattern(regex: str, in_words: str, **others: Any) -> Meta:
+    """What a text must look like, and that in words, for messages."""
+    return Meta(pattern=regex, extra={_IN_WORDS: in_words}, **others)
+
+
 Finite = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
-Version = Annotated[str, Meta(pattern=r"(?a)\A\w[\w.+!-]*\Z")]  # or the name of a package
-Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z")]
+Version = Annotated[str, pattern(r"(?a)\A\w[\w.+!-]*\Z", "a version")]  # or the name of a package
+Sha256 = Annotated[str, pattern(r"\A[0-9a-f]{64}\Z", "a SHA-256: 64 hexadecimal digits")]
 
 _MESSAGE = re.compile(r"(.*?)(?: - at `\$(.*)`)?", re.DOTALL)  # msgspec's, and where
 _FIELD = re.compile(r"Object (missing required|contains unknown) field `(.*)`")
@@ -36,6 +45,7 @@ _WITH_PARTS = (
     *(inspect.CollectionType, inspect.TupleType),
 )
 _MOST_SHOWN = 60  # letters of a value
+_TOO_LARGE = 10**18  # of a whole number that is given as text
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, dict=True):
@@ -75,12 +85,28 @@ def from_text(text: str, kind: Any, where: str) -> Any:
     """A value of a type from text, as people write it: 0.5, or 1,5,10, or size=2,mass=0.5."""
     parts = [part.strip() for part in text.split(",")]
     match bare(type_of(kind)):
+        case inspect.IntType():
+            return converted(_whole(text, where), kind, where)
         case inspect.CollectionType():
             return converted(parts, kind, where, strict=False)
         case inspect.DictType() if all("=" in part for part in parts):
             pairs = dict(part.split("=", 1) for part in parts)
             return converted(pairs, kind, where, strict=False)
     return converted(text, kind, where, strict=False)
+
+
+def _whole(text: str, where: str) -> int:
+    """A whole number as people write it: 5000000, 5_000_000, 5e6, 5M, 5k."""
+    digits = text.replace("_", "").lower()
+    factor = {"k": 1_000, "m": 1_000_000}.get(digits[-1:], 1)
+    try:
+        number = Decimal(digits[:-1] if factor > 1 else digits) * factor
+    except ArithmeticError:
+        number = Decimal("nan")
+    if not (number.is_finite() and abs(number) < _TOO_LARGE and number == int(number)):
+        must_be = "a whole number: write it as 5000000, 5_000_000, 5e6 or 5M"
+        raise InputError(f"{where} is {shown(text)}: it must be {must_be}")
+    return int(number)
 
 
 def converted(value: Any, kind: Any, where: str, strict: bool = True) -> Any:
@@ -98,9 +124,11 @@ def _line(message: str, value: Any, kind: Any, where: str) -> str:
     found = _MESSAGE.fullmatch(message)
     reason, path = found.groups("") if found else (message, "")
     place = f"{where}{path}".removeprefix(".")
-    nodes = [*_plain([type_of(kind)])]
+    told = [type_of(kind)]
+    nodes = [*_plain(told)]
     for field, index in _STEP.findall(path):
-        nodes = [*_plain(part for each in nodes for part in _parts(each, field or index))]
+        told = [part for each in nodes for part in _parts(each, field or index)]
+        nodes = [*_plain(told)]
         value = _inside(value, field or index)
     if field := _FIELD.fullmatch(reason):
         name = f"{place}.{field[2]}" if place else field[2]
@@ -109,6 +137,8 @@ def _line(message: str, value: Any, kind: Any, where: str) -> str:
         return f"unknown {name}: {_choices(nodes, 'it must be one of ') or 'there are none'}"
     if reason.startswith("Expected "):
         must_be = reason.removeprefix("Expected ").partition(", got")[0]
+        if "matching regex" in must_be:
+            must_be = next(_words(told), must_be)
     elif reason.startswith("Invalid "):
         must_be = _choices(nodes, "one of ")
     else:  # what `check` said
@@ -135,6 +165,18 @@ def _plain(nodes: Iterable[inspect.Type]) -> Iterator[inspect.Type]:
                 yield from _plain(types)
             case _:
                 yield node
+
+
+def _words(nodes: Iterable[inspect.Type]) -> Iterator[str]:
+    """What `pattern` says of types in words."""
+    for node in nodes:
+        match node:
+            case inspect.Metadata(type=inner, extra=extra):
+                if extra and _IN_WORDS in extra:
+                    yield extra[_IN_WORDS]
+                yield from _words([inner])
+            case inspect.UnionType(types=types):
+                yield from _words(types)
 
 
 def _parts(node: inspect.Type, step: str) -> list[inspect.Type]:

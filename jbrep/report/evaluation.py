@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from jbrep.encoders import FULL
+from jbrep.evaluate.diagnosis import SCALARS
 from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Lost, Score
-from jbrep.evaluate.table import SCALARS
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.report.views import say
 from jbrep.text import SIGNIFICANT, Table, facts, html, number, r2_text, wrapped

@@ -10,8 +10,8 @@ from jbrep.encoders import FULL
 from jbrep.encoders.base import OWN
 from jbrep.envs.infos import shares
 from jbrep.envs.names import modules_of
+from jbrep.evaluate.diagnosis import SCALARS
 from jbrep.evaluate.evaluation import Score
-from jbrep.evaluate.table import SCALARS
 from jbrep.records.document import Document
 from jbrep.records.record import Record, from_plain
 from jbrep.records.record import to_plain as record_to_plain

@@ -16,7 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from jbrep.errors import InputError, refusing
-from jbrep.records.record import converted, shown, to_plain
+from jbrep.records.record import converted, pattern, shown, to_plain
 from jbrep.rl.agent import ACTIVATIONS, Spaces, global_random_state_kept, make_agent, one_line
 from jbrep.rl.presets import (
     Hyperparameters,
@@ -40,7 +40,13 @@ _RANGES: dict[str, tuple[float, float]] = {  # others: from 1 if whole, else fro
     "n_critics": (1, 10),
     "n_quantiles": (1, 200),
 }
-_SCHEDULE = Annotated[str, Meta(pattern=r"\Alinear:([0-9]+\.?[0-9]*|\.[0-9]+)(e-?[0-9]{1,2})?\Z")]
+_SCHEDULE = Annotated[
+    str,
+    pattern(
+        r"\Alinear:([0-9]+\.?[0-9]*|\.[0-9]+)(e-?[0-9]{1,2})?\Z",
+        "a number, or linear:NUMBER for one that falls to 0",
+    ),
+]
 _FREQUENCY = Annotated[  # of two parts, but msgspec 0.22 crashes on that beside a bounded number
     tuple[Annotated[int, Meta(ge=1)] | Literal["step", "episode"], ...],
     Meta(min_length=2, max_length=2),

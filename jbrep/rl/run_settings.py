@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import UNSET, Meta, UnsetType
+from msgspec import UNSET, UnsetType
 
 from jbrep.envs.task import Id, Task
 from jbrep.errors import InputError, differences
-from jbrep.records.record import Sha256, to_plain
+from jbrep.records.record import Sha256, pattern, to_plain
 from jbrep.rl.presets import LINEAR, Hyperparameters, learns_from
 from jbrep.rl.settings import (
     CLASSES,
@@ -21,7 +21,7 @@ from jbrep.rl.settings import (
     TrainingSettings,
 )
 
-_Algorithm = Annotated[str, Meta(pattern=rf"\A({'|'.join(CLASSES)})\Z")]
+_Algorithm = Annotated[str, pattern(rf"\A({'|'.join(CLASSES)})\Z", f"one of {', '.join(CLASSES)}")]
 
 
 class SharedSettings(TrainingSettings, frozen=True, kw_only=True):

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from jbrep.errors import InputError
-from jbrep.records.record import Record
+from jbrep.records.record import Record, pattern
 
 CLASSES = {  # by the names of algorithms
     "ddpg": "stable_baselines3.DDPG",
@@ -26,13 +26,21 @@ MAX_SEED = (1 << 31) - 1
 MAX_LINE = 1000  # letters
 MAX_NAME = 100  # letters of a learner's name
 
+_LETTERS = "letters, digits, '_', '-' and '.'"
 Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
-Name = Annotated[str, Meta(pattern=r"\A[\w.-]{1,100}\Z")]
-LearnerName = Annotated[str, Meta(pattern=rf"\A(?=.*[^.])[\w.+=-]{{1,{MAX_NAME}}}\Z")]
+Name = Annotated[str, pattern(r"\A[\w.-]{1,100}\Z", f"1 to 100 {_LETTERS}")]
+LearnerName = Annotated[
+    str,
+    pattern(
+        rf"\A(?=.*[^.])[\w.+=-]{{1,{MAX_NAME}}}\Z",
+        f"1 to {MAX_NAME} {_LETTERS}, '+' and '=', not only dots",
+    ),
+]
 Line = Annotated[  # nothing in it controls a terminal
     str,
-    Meta(
-        pattern=rf"\A[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]{{0,{MAX_LINE}}}\Z"
+    pattern(
+        rf"\A[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]{{0,{MAX_LINE}}}\Z",
+        f"a line of up to {MAX_LINE} letters",
     ),
 ]
 Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]

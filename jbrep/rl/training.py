@@ -22,7 +22,7 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.infos import by_name
 from jbrep.envs.lanes import EnvironmentFailedError, Lanes, NonFiniteActionError, lanes_at_once
 from jbrep.envs.names import environment_versions
-from jbrep.errors import InputError
+from jbrep.errors import InputError, StoppedError
 from jbrep.machine import cpu
 from jbrep.records.commit import commits
 from jbrep.records.lock import exclusive
@@ -82,14 +82,6 @@ _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "to
 
 class DivergedError(ArithmeticError):
     """A loss or a weight of the policy is NaN or infinite: training can't continue."""
-
-
-class StoppedError(Exception):
-    """A run stopped on request after so many steps, its checkpoint written; `train` resumes it."""
-
-    def __init__(self, step: int):
-        super().__init__(f"stopped after {step:,} steps")
-        self.step = step
 
 
 class Session(NamedTuple):

@@ -20,7 +20,7 @@ from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.records.document import Document
-from jbrep.records.record import Record, converted, from_plain, to_plain
+from jbrep.records.record import Record, converted, from_plain, pattern, to_plain
 from jbrep.records.storage import exists
 from jbrep.records.toml import read_toml, toml_text
 from jbrep.rl.learner import Learner
@@ -41,7 +41,13 @@ from jbrep.text import slug
 
 _MOST_SEEDS = (1 << 16) - 1
 UNIFORM = Uniform.kind
-_DataName = Annotated[str, Meta(pattern=r"\A(?=.*[^.])[A-Za-z0-9_.-]{1,100}\Z")]
+_DataName = Annotated[
+    str,
+    pattern(
+        r"\A(?=.*[^.])[A-Za-z0-9_.-]{1,100}\Z",
+        "1 to 100 letters of ASCII, digits, '_', '-' and '.', not only dots",
+    ),
+]
 
 
 class Data(Record, frozen=True, kw_only=True):

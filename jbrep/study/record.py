@@ -16,7 +16,7 @@ from jbrep.encoders.base import OWN
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.document import Document
-from jbrep.records.record import MOST_WHOLE, Record, Sha256, Version, from_plain, to_plain
+from jbrep.records.record import MOST_WHOLE, Record, Sha256, Version, from_plain, pattern, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, RunRecord
 from jbrep.rl.run_settings import RunSettings, SharedSettings
@@ -39,7 +39,9 @@ Layers = Annotated[tuple[Layer, ...], Meta(max_length=100)]
 class LabelSettings(SharedSettings, frozen=True, kw_only=True):
     """The settings that all runs of a label share: without the seed and what depends on it."""
 
-    encoder: Annotated[str, Meta(pattern=f"^([0-9a-f]{{64}}|{EACH_ITS_OWN})$")]
+    encoder: Annotated[
+        str, pattern(f"^([0-9a-f]{{64}}|{EACH_ITS_OWN})$", f"a SHA-256, or {EACH_ITS_OWN}")
+    ]
     begin_from: str | None = msgspec.field(name="from")
 
 

@@ -15,7 +15,7 @@ from jbrep.encoders.names import check_name, of_seed
 from jbrep.envs.names import is_code
 from jbrep.errors import InputError
 from jbrep.methods.registry import Recipe, get_method, read_name
-from jbrep.records.record import Record, converted, from_plain
+from jbrep.records.record import Record, converted, from_plain, pattern
 from jbrep.text import slug
 from jbrep.training.settings import BatchSize, Epochs, LearningRate, NoiseDeviation, Seed
 
@@ -24,7 +24,13 @@ Given = str | dict[str, Any]  # a representation in a study's file: a name or a 
 MAX_ENCODERS = 1000  # of one representation
 _TASK, _SEED, _ENCODER = "{task}", "{seed}", "{encoder}"  # in a file's path, see ByFile
 _Path = Annotated[str, Meta(min_length=1)]
-_OwnName = Annotated[str, Meta(pattern=rf"\A(?!{FULL}\Z)(?=.*[^.])[A-Za-z0-9_.-]{{1,100}}\Z")]
+_OwnName = Annotated[
+    str,
+    pattern(
+        rf"\A(?!{FULL}\Z)(?=.*[^.])[A-Za-z0-9_.-]{{1,100}}\Z",
+        f"1 to 100 letters of ASCII, digits, '_', '-' and '.', not only dots, and not {FULL}",
+    ),
+]
 
 
 class _Training(Record, frozen=True, kw_only=True):

@@ -1,0 +1,160 @@
+"""Parameters that several functions and commands share: type, range, and what they mean.
+
+The other parameters of a function are described in its docstring. `jbrep.cli.generator` makes the
+options of commands from both.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any
+
+from msgspec import Meta
+
+from jbrep.errors import InputError
+from jbrep.rl.settings import CLASSES
+
+if TYPE_CHECKING:
+    from jbrep.envs.task import Task
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+Lanes = Annotated[
+    int, Meta(ge=1, le=100_000, description="Environments of a batch, stepped at once.")
+]
+Threads = Annotated[
+    Annotated[int, Meta(ge=1, le=4096)] | None,
+    Meta(
+        description="Threads of a batch, or instances of other environments at once; as many as "
+        "cores by default. A robot that exists once needs 1."
+    ),
+]
+Retries = Annotated[
+    int,
+    Meta(
+        ge=0,
+        le=1_000_000,
+        description="How often in a row an environment that fails is made anew and tried again.",
+    ),
+]
+Episodes = Annotated[
+    int, Meta(ge=1, le=10_000, description="How many episodes, the same each time.")
+]
+Backend = Annotated[
+    str,
+    Meta(description="Where: local, this machine, or ray, the cluster that RAY_ADDRESS names."),
+]
+Workers = Annotated[
+    Annotated[int, Meta(ge=1, le=1024)] | None,
+    Meta(
+        description="Processes at a time.",
+        extra={"default": "one for each core; one if it learns on a GPU"},
+    ),
+]
+TaskName = Annotated[
+    str | None,
+    Meta(
+        description="One of the Jitterbug's tasks, such as face_direction, or a Gymnasium id: "
+        "Hopper-v5."
+    ),
+]
+Hide = Annotated[
+    Sequence[str],
+    Meta(
+        description="A feature or group that isn't seen, or a pattern: 'velocity_*'; may be "
+        "repeated.",
+        extra={"metavar": "NAME"},
+    ),
+]
+History = Annotated[
+    int,
+    Meta(
+        ge=1,
+        le=1000,
+        description="States that are seen at once, the current one and those before, with the "
+        "actions between.",
+    ),
+]
+Data = Annotated[str, Meta(description="A folder from jbrep collect.", extra={"metavar": "FOLDER"})]
+Out = Annotated[Path, Meta(description="A folder.")]
+NewFile = Annotated[Path, Meta(description="A new file.")]
+Algorithm = Annotated[str, Meta(description=f"One of {', '.join(CLASSES)}.")]
+Preset = Annotated[
+    str,
+    Meta(
+        description="Its settings: paper, modern, wide, or a TOML file with a table for each "
+        "algorithm.",
+        extra={"default": "wide, or modern where that has none"},
+    ),
+]
+Overrides = Annotated[
+    Mapping[str, Any],
+    Meta(
+        description="A setting other than the preset's, by stable-baselines3's name, such as "
+        "learning_rate=3e-4, net_arch=[64,64] or learning_rate=linear:3e-4; may be repeated.",
+        extra={"option": "set"},
+    ),
+]
+Normalize = Annotated[
+    bool,
+    Meta(description="Normalise what the agent sees by its running mean and variance."),
+]
+Seen = Annotated[
+    Any,
+    Meta(
+        description="What it sees: an encoder's file, a shipped encoder's name, or code as "
+        "module:Class, which is run; full is the whole observation, scaled alike.",
+        extra={"is_code": True},
+    ),
+]
+AsJson = Annotated[bool, Meta(description="As JSON, for programs.", extra={"option": "json"})]
+
+
+def described(
+    task: TaskName = None,
+    env: Mapping[str, Any] = NOTHING,
+    episode_steps: Annotated[int, Meta(ge=1)] | None = None,
+    features: Path | None = None,
+    missing: Annotated[str | None, Meta(extra={"metavar": "[skip|hold:N]"})] = None,
+    hide: Hide = (),
+    history: History = 1,
+) -> "Task | None":
+    """The task of that name, with what is said of its environment; None if nothing is.
+
+    Args:
+        env: an argument of the environment, such as g=1.6; may be repeated.
+        episode_steps: the time limit of an episode; the environment's own by default.
+        features: a TOML file with names, units, ranges, kinds and offsets of the features.
+        missing: what becomes of readings that aren't finite: an episode ends before one, or the
+            last one is held for at most N steps; otherwise they are errors.
+    """
+    if task is None:
+        if env or episode_steps or features or missing or hide or history > 1:
+            raise InputError("give the --task: one of the Jitterbug's, or a Gymnasium id")
+        return None
+    from jbrep.envs.description import describe
+    from jbrep.envs.names import name_given
+
+    return describe(name_given(task), env, episode_steps, features, missing, hide, history)
+
+
+def drawn(
+    domain: Mapping[str, Any] = NOTHING, **options: Annotated[Any, described]
+) -> "Task | None":
+    """A task that is described, with what its episodes draw.
+
+    Args:
+        domain: what each episode draws: noise, delay, dropped, action_delay, friction, mass, push
+            or body, such as delay=0..2 or friction=0.5..1.5; may be repeated.
+    """
+    from jbrep.envs.description import with_domain
+
+    task = described(**options)
+    return with_domain(task, domain) if task and domain else task
+
+
+# What Python calls a task by its name or itself is for a command what its options describe.
+NeededTask = Annotated["Task", Meta(extra={"made_by": described})]
+GivenTask = Annotated["Task | str", Meta(extra={"made_by": described})]
+DrawnTask = Annotated["Task", Meta(extra={"made_by": drawn})]
+GivenDrawnTask = Annotated["Task | str", Meta(extra={"made_by": drawn})]
+OptionalTask = Annotated["Task | None", Meta(extra={"made_by": described})]
