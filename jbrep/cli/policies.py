@@ -195,16 +195,23 @@ def evaluate_policy(
     from jbrep.encoders.shipped import source_of
     from jbrep.envs.infos import Numbers
     from jbrep.envs.lanes import EnvironmentFailedError
+    from jbrep.play.perturbed import read_perturbation
     from jbrep.play.sources import is_by_name
+    from jbrep.records.storage import exists, taken
 
-    _check_perturbations(perturb, out)
+    chosen = [each for each in perturb if each]
+    for each in chosen:
+        read_perturbation(each)
+    if out and not perturb:
+        raise InputError("--out is for the table of --perturb: add that")
+    if out and exists(out):
+        raise taken(out)
     if is_by_name(policy):
         options.setdefault("task", _TASK)
     of_zip = {"algorithm": algorithm, "trust": trust, "vecnormalize": vecnormalize}
     player = _find(policy, described(**options), encoder, **of_zip)
     source = None if encoder is None else source_of(encoder, player.task)
     if perturb:
-        chosen = [each for each in perturb if each]
         _perturb(policy, player, chosen, (episodes, threads, retries), out, as_json)
         return False
     returns, numbers, failure = list[float](), list[Numbers](), ""
@@ -253,18 +260,6 @@ def _show_returns(
     if told := shares_text(by_name(numbers)):
         tell(told)
     return None
-
-
-def _check_perturbations(perturbations: Sequence[str], out: Path | None) -> None:
-    from jbrep.play.perturbed import read_perturbation
-    from jbrep.records.storage import exists, taken
-
-    for each in filter(None, perturbations):
-        read_perturbation(each)
-    if out and not perturbations:
-        raise InputError("--out is for the table of --perturb: add that")
-    if out and exists(out):
-        raise taken(out)
 
 
 def _perturb(
