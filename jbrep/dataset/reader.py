@@ -28,7 +28,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
 
 if TYPE_CHECKING:
-    from jbrep.dataset.formats.episodes import Source
+    from jbrep.dataset.formats.source import Source
 
 _OPEN_SHARDS = 256  # memory-mapped at a time, at most: each takes a file descriptor
 _MEMORY = 4 << 30  # [bytes]
@@ -142,12 +142,14 @@ class Dataset:
         Returns:
             The data set.
         """
-        from jbrep.dataset.formats.flat import source_of  # imports Gymnasium
+        from jbrep.dataset.formats.arrays import frame_in_python  # imports Arrow
+        from jbrep.dataset.formats.source import Source
 
         columns = {"observation": observations, "action": actions, "reward": rewards}
         columns |= {"terminated": terminations, "truncated": truncations}
         once = {"final_observation": final_observations, "seed": seeds}
-        return _written(folder, source_of(columns, once, source), None, "", task)
+        opened = Source(frame_in_python(columns, once, source))
+        return _written(folder, opened, None, "", task)
 
     @staticmethod
     def from_table(
@@ -172,10 +174,10 @@ class Dataset:
         Returns:
             The data set.
         """
-        from jbrep.dataset.formats.arrow import table_of
-        from jbrep.dataset.formats.logs import source_of_table
+        from jbrep.dataset.formats.frame import frame_of_table
+        from jbrep.dataset.formats.source import Source
 
-        opened = source_of_table(table_of(table, source), layout, missing)
+        opened = Source(frame_of_table(table, source), layout, missing)
         return _written(folder, opened, layout, missing, task)
 
     @staticmethod
