@@ -100,14 +100,6 @@ def inside(folder: Path, *parts: str) -> Path:
     return path
 
 
-def check_plain(folder: Path) -> None:
-    """Make sure that a folder, which may be a stranger's, leads nowhere else and can be read."""
-    for path in sorted(folder.rglob("*")):
-        kind = path.lstat().st_mode
-        if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-            raise InputError(f"{path} must be a plain file: no link, pipe or device is opened")
-
-
 def sync(path: Path) -> None:
     """Bring a file, or the names in a folder, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)

@@ -14,11 +14,10 @@ import pyarrow as pa
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from jbrep.dataset.formats.frame import CHUNK, Frame, label_of
+from jbrep.dataset.formats.frame import CHUNK, Frame, check_plain, label_of
 from jbrep.dataset.layout import Layout
 from jbrep.envs.task import MAX_FEATURES
 from jbrep.errors import InputError, refusing
-from jbrep.records.storage import check_plain
 
 _TIME = "time"
 _DEEPEST = 8  # messages in messages

@@ -1,7 +1,9 @@
 """Frames: rows with named columns in Arrow's types, into which every format is read."""
 
+import stat
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
@@ -63,6 +65,14 @@ class Frame:
     is_sparse: bool = False  # whether a row has numbers of some columns only
     place: Callable[[int], str] = "row {}".format  # a row's name in messages, by number from 0
     notes: tuple[str, ...] = ()  # on what its format leaves out
+
+
+def check_plain(folder: Path) -> None:
+    """Make sure that a folder, which may be a stranger's, leads nowhere else and can be read."""
+    for path in sorted(folder.rglob("*")):
+        kind = path.lstat().st_mode
+        if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+            raise InputError(f"{path} must be a plain file: no link, pipe or device is opened")
 
 
 def label_of(name: str) -> str:

@@ -15,14 +15,14 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jbrep.dataset.formats.arrays import column_of
-from jbrep.dataset.formats.frame import PEEKED, About, Frame, label_of, measured, width
+from jbrep.dataset.formats.frame import PEEKED, About, Frame, check_plain, label_of, measured, width
 from jbrep.dataset.formats.parquet import batches_of, reading
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
 from jbrep.errors import InputError, refusing
 from jbrep.progress import Progress
-from jbrep.records.storage import check_plain, publish_folder, unfinished
+from jbrep.records.storage import publish_folder, unfinished
 
 Array = NDArray[Any]
 

@@ -24,7 +24,7 @@ from minari.namespace import NAMESPACE_METADATA_FILENAME
 from numpy.typing import NDArray
 
 from jbrep.dataset.formats.arrays import frame_of_steps, joined
-from jbrep.dataset.formats.frame import About, Frame, label_of
+from jbrep.dataset.formats.frame import About, Frame, check_plain, label_of
 from jbrep.dataset.formats.hdf5 import opened
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.rewards import without_range
@@ -36,7 +36,6 @@ from jbrep.errors import InputError, kind_and_line, listed, refusing
 from jbrep.progress import Progress
 from jbrep.records.storage import (
     check_allocation,
-    check_plain,
     exists,
     make_folder,
     publish_folder,
