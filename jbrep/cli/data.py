@@ -299,7 +299,7 @@ def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
         opened = open_sources(source, layout, missing)
         said = {} if task else _given(told)
         manifest = write(opened, out, task, **said, reward=reward)
-    for note in opened.notes:
+    for note in opened.notes():
         say(note)
     for (noun, what), count in opened.changes().items():
         say(f"{counted(count, noun)} {what}")
