@@ -312,7 +312,7 @@ def test_steps_that_are_no_number_are_refused(text, tmp_path):
     ("package", "extra", "users", "command"),
     [
         ("torch", "learn", ("jbrep.dae", "jbrep.methods.fit"), "train-dae --latent 8 --data {}"),
-        ("pyarrow", "export", "jbrep.dataset.formats.parquet", "data export {} --to parquet"),
+        ("minari", "export", "jbrep.dataset.formats.minari", "data export {} --to minari"),
     ],
 )
 def test_a_missing_extra_is_named(package, extra, users, command, monkeypatch, tmp_path, collected):

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from small import flip_bit
 
 from jbrep.dataset import Dataset
-from jbrep.dataset.formats import FORMATS, export, open_source
-from jbrep.errors import DamageError, InputError
+from jbrep.dataset.formats import FORMATS, export, open_sources
+from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.records.lock import exclusive
 
@@ -110,39 +109,14 @@ def test_a_table_belongs_to_the_file_of_its_episodes(dataset, tmp_path):
     export(dataset, "parquet", path)
     beside.unlink()
     with pytest.raises(InputError, match=r"data-episodes\.parquet is missing: it belongs to"):
-        open_source(str(path))
+        open_sources([str(path)])
     beside.write_bytes(content[:-1])
-    with pytest.raises(DamageError, match=r"is damaged, or of another data set than"):
-        open_source(str(path))
+    with pytest.raises(InputError, match=r"data-episodes\.parquet can't be read"):
+        open_sources([str(path)])
     path.unlink()
     with pytest.raises(InputError, match=r"data-episodes\.parquet exists already"):
         export(dataset, "parquet", path)
     assert not path.exists()
-
-
-@pytest.mark.parametrize("to", ["parquet", "minari"])
-def test_a_flipped_bit_of_an_export_is_noticed(to, brief, tmp_path):
-    """Or changes nothing that is imported."""
-    export(Dataset(brief), to, tmp_path / f"data.{to}")
-    files = sorted(path for path in tmp_path.rglob("*") if path.is_file())
-    given = files[0].parent if to == "minari" else tmp_path / f"data.{to}"
-    given = next(tmp_path.rglob("metadata.json")).parent if to == "minari" else given
-
-    def read():
-        return [[np.asarray(p).tolist() for p in e] for e in open_source(str(given)).episodes()]
-
-    whole, random, missed = read(), np.random.default_rng(0), []
-    for _ in range(40):
-        path = files[random.integers(len(files))]
-        bit = random.integers(8 * path.stat().st_size)
-        flip_bit(path, bit)
-        try:
-            if read() != whole:
-                missed.append((path, bit))
-        except InputError as error:
-            assert "\n" not in str(error)  # noqa: PT017
-        flip_bit(path, bit)
-    assert not missed
 
 
 @pytest.mark.parametrize("name", ["", ".", "/"])
@@ -286,7 +260,7 @@ import os, signal, sys
 
 class Stop:
     def find_spec(self, name, path, target=None):
-        if name == "mujoco._enums":  # imported while another of MuJoCo's modules is initialised
+        if name == "pyarrow.lib":
             os.kill(os.getpid(), signal.SIGINT)
 
 sys.meta_path.insert(0, Stop())

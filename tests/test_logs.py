@@ -1,14 +1,12 @@
 """Logs of real robots: layouts as loggers write them, incomplete as they are."""
 
-import hashlib
 import json
 import math
+import os
 import re
 import shlex
 import shutil
-import sqlite3
 import sys
-from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -20,11 +18,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from command import jbrep, mistake
-from foreign import GYRO, PITCH, RATE, TIMES, VOLTS, csv_rows, lerobot_folder, write_bag, write_csv
+from foreign import (
+    GYRO,
+    PITCH,
+    RATE,
+    TIMES,
+    VOLTS,
+    csv_rows,
+    imported,
+    lerobot_folder,
+    not_imported,
+    write_bag,
+    write_csv,
+)
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from small import flip_bit
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from jbrep.collect import collect
 from jbrep.collect.derive import derive_view
@@ -37,7 +45,6 @@ from jbrep.dataset import (
     from_file,
     from_table,
 )
-from jbrep.dataset.formats import bag_reader
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
 from jbrep.errors import InputError, Notice
@@ -46,15 +53,6 @@ from jbrep.methods.fit import Fitter
 from jbrep.report.evaluation import untold
 
 NAMED = ("--observations", "pitch,gyro,ticks", "--actions", "u", "--time", "time")
-
-
-def imported(path, *options, out="data"):
-    """What the command says, and the data set."""
-    folder = path.parent / out
-    done = jbrep("data", "import", path, *options, "--out", folder)
-    assert done.exit_code == 0, done.output
-    assert not list(find_problems(folder))
-    return done.output, Dataset(folder)
 
 
 def test_a_csv_as_loggers_write_it(tmp_path):
@@ -76,11 +74,11 @@ def test_a_csv_as_loggers_write_it(tmp_path):
     assert data.columns == ("observation", "action", "episode", "step")
     for line in (
         "120 rows read",
-        "1 gap of more than 0.5 s: an episode ends there",
-        "2 rows after the last action of an episode, or alone",
+        "1 gap of more than 0.5 s",
+        "2 rows after the last action",
         "not used: status",
         "1 angle brought to [-pi, pi) rad, 1 of them from degrees",
-        "no rewards: what needs some will say so",
+        "no rewards",
         "ticks is near 420000000 and changes by about 1",
         "2 episodes of a, 118 rows",
     ):
@@ -103,9 +101,7 @@ def test_a_line_of_units_tabs_and_dates(tmp_path):
 
 def test_missing_cells_are_cut_or_held_and_counted(tmp_path):
     path = write_csv(tmp_path / "a.csv", csv_rows(gyro=dict.fromkeys((30, 31), "")))
-    done = jbrep("data", "import", path, *NAMED, "--gap", "1", "--out", tmp_path / "no")
-    assert (done.exit_code, done.output.count("\n")) == (2, 1)
-    assert "a.csv, line 32: 'gyro' is empty" in done.output
+    assert "a.csv, line 32: 'gyro' is empty" in not_imported(path, *NAMED, "--gap", "1")
     told, data = imported(path, *NAMED, "--gap", "1", "--missing", "skip")
     assert data.episodes["length"].tolist() == [29, 27, 59]
     assert "2 missing readings (skip): 3 steps left out" in " ".join(told.split())
@@ -117,12 +113,11 @@ def test_missing_cells_are_cut_or_held_and_counted(tmp_path):
     _, data = imported(path, *names, "--missing", "hold:1", out="turns")
     assert data["observation"][:].tolist() == [[0, 0], [1, 0], [1, 2], [3, 2], [3, 4]]
     for column, cells, told in (
-        ("x", ["", *range(5)], "feature 0 is missing at step 0, with none before to hold: give"),
-        ("u", [0, 1, "", 3, 4, 5], "lacks its action at step 2, which can't be held: leave"),
+        ("x", ["", *range(5)], "feature 0 is missing at step 0"),
+        ("u", [0, 1, "", 3, 4, 5], "lacks its action at step 2"),
     ):
         write_csv(path, turns | {column: cells})
-        command = ("data", "import", path, *names, "--missing", "hold:1", "--out", tmp_path / "no")
-        assert told in mistake(*command)
+        assert told in not_imported(path, *names, "--missing", "hold:1")
 
 
 def test_uneven_clocks_are_brought_to_an_even_one(tmp_path):
@@ -304,51 +299,42 @@ def test_data_without_rewards_go_through_what_needs_none(tmp_path):
     assert f"{data.folder} has no rewards: jbrep data derive --reward gives some\n" in done.output
 
 
-BAD = {
-    "line 6, column 'gyro': invalid value '1,5.2'": ({"gyro": {4: '"1,5.2"'}}, NAMED),
-    "line 9: expected 6 columns, got 7": ({"status": {7: "a,b"}}, NAMED),
-    "line 4: 'time' is empty": ({"time": {2: ""}}, (*NAMED, "--missing", "skip")),
-    "line 7: 'u' is empty, or no finite number": ({"u": {5: "inf"}}, NAMED),
-    "has no column 'speed': it has time, pitch, gyro": ({}, (*NAMED[:1], "speed", *NAMED[2:])),
-    "has string in the column 'status'": ({}, ("--actions", "u", "--time", "time")),
-    "doesn't tell where an episode ends": ({}, NAMED[:4]),
-    "--gap needs --time": ({}, (*NAMED[:4], "--gap", "1")),
-    "the times 'time' are in 'days'": ({}, (*NAMED, "--units", "time=days")),
-    "the angle 'gyro' in 'rad/s'": ({}, (*NAMED, "--angles", "gyro")),
-    "has no observation 'u': it has pitch, gyro, ticks": ({}, (*NAMED, "--angles", "u")),
-    "an episode comes in two parts": ({"status": {9: "b"}}, (*NAMED, "--episode", "status")),
-    "missing is 'hld:1'": (
-        {"gyro": {5: ""}},
-        (*NAMED, "--missing", "hld:1"),
-    ),
-    "--hide and --history need a --task here": ({}, (*NAMED, "--hide", "gyro")),
-    "of a log name the column of times": ({}, NAMED[:4]),
-    "fill is 'cubic': it must be": ({}, (*NAMED, "--fill", "cubic")),
-    "--fill linear needs --rate": ({}, (*NAMED, "--fill", "linear")),
-    "can't be read as rows of text: field larger": ({"status": {3: "a" * 200_000}}, NAMED),
+BAD = {  # words of the line that refuses it: the place, and the column or option
+    "line 6 gyro 1,5.2": ({"gyro": {4: '"1,5.2"'}}, NAMED),
+    "line 9 expected 6 got 7": ({"status": {7: "a,b"}}, NAMED),
+    "line 4 time": ({"time": {2: ""}}, (*NAMED, "--missing", "skip")),
+    "line 7 u": ({"u": {5: "inf"}}, NAMED),
+    "column speed pitch": ({}, (*NAMED[:1], "speed", *NAMED[2:])),
+    "line 2 status": ({}, ("--actions", "u", "--time", "time")),
+    "--time --episode --length": ({}, NAMED[:4]),
+    "--gap --time": ({}, (*NAMED[:4], "--gap", "1")),
+    "time days ms": ({}, (*NAMED, "--units", "time=days")),
+    "gyro rad/s deg": ({}, (*NAMED, "--angles", "gyro")),
+    "observation u pitch": ({}, (*NAMED, "--angles", "u")),
+    "episode two parts": ({"status": {9: "b"}}, (*NAMED, "--episode", "status")),
+    "missing hld:1": ({"gyro": {5: ""}}, (*NAMED, "--missing", "hld:1")),
+    "--hide --history --task": ({}, (*NAMED, "--hide", "gyro")),
+    "fill cubic": ({}, (*NAMED, "--fill", "cubic")),
+    "--fill --rate": ({}, (*NAMED, "--fill", "linear")),
+    "rows field larger": ({"status": {3: "a" * 200_000}}, NAMED),
 }
 
 
-@pytest.mark.parametrize("problem", BAD)
-def test_what_is_wrong_is_told_in_a_line_with_its_place(problem, tmp_path):
-    changes, options = BAD[problem]
-    path = write_csv(tmp_path / "a.csv", csv_rows(**changes))
-    done = jbrep("data", "import", path, *options, "--out", tmp_path / "out")
-    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
-    assert problem in done.stderr
-    assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
+@pytest.mark.parametrize("words", BAD)
+def test_what_is_wrong_is_told_in_a_line_with_its_place(words, tmp_path):
+    changes, options = BAD[words]
+    told = not_imported(write_csv(tmp_path / "a.csv", csv_rows(**changes)), *options)
+    assert all(word in told for word in words.split())
 
 
 def test_text_that_is_no_table(tmp_path):
     for content, problem in {
-        b"": "is empty: its first line must name the columns",
-        b"1,2\n3,4\n": "line 1: a number where the columns must be named",
-        b"a,b\n\xff\xfe,3\n": "it must be in UTF-8",
+        b"": "is empty",
+        b"1,2\n3,4\n": "line 1: a number",
+        b"a,b\n\xff\xfe,3\n": "UTF-8",
     }.items():
         (tmp_path / "a.csv").write_bytes(content)
-        done = jbrep("data", "import", tmp_path / "a.csv", "--out", tmp_path / "out")
-        assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
-        assert problem in done.stderr
+        assert problem in not_imported(tmp_path / "a.csv")
 
 
 def test_lists_in_a_table_and_integers_as_actions(tmp_path):
@@ -361,8 +347,7 @@ def test_lists_in_a_table_and_integers_as_actions(tmp_path):
     )
     frame.write_parquet(tmp_path / "a.parquet")
     assert "list" in str(pq.read_schema(tmp_path / "a.parquet").field("observation").type)
-    done = jbrep("data", "import", tmp_path / "a.parquet", "--out", tmp_path / "out")
-    assert "has no actions" in done.output
+    assert "has no actions" in not_imported(tmp_path / "a.parquet")
     _, data = imported(tmp_path / "a.parquet", "--actions", "pulse", "--episode", "trial")
     assert data.task.feature_names == ("observation_0", "observation_1")
     assert (data.task.action_low, data.task.action_high) == ((1000,), (1380,))
@@ -370,8 +355,8 @@ def test_lists_in_a_table_and_integers_as_actions(tmp_path):
     frame = polars.concat([frame.with_row_index("i"), ragged], how="vertical_relaxed")
     frame.write_parquet(tmp_path / "b.parquet")
     names = ("--observations", "observation", "--actions", "pulse", "--episode", "trial")
-    done = jbrep("data", "import", tmp_path / "b.parquet", *names, "--out", tmp_path / "out")
-    assert "b.parquet, row 40: 'observation' has 1 numbers, not 2 as before" in done.output
+    told = not_imported(tmp_path / "b.parquet", *names)
+    assert all(word in told for word in ("b.parquet, row 40", "'observation'"))
 
 
 def test_several_logs_are_an_episode_each(tmp_path):
@@ -387,24 +372,22 @@ def test_several_logs_are_an_episode_each(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("values", "is_time"),
     [
-        (pa.array(range(9), pa.date32()), "has date32[day] in the column 't': times must be"),
-        (pa.array([False] * 9), "has bool in the column 't': times must be numbers"),
-        (pa.array(range(9), pa.timestamp("s")).cast(pa.int64()), None),
-        (pa.array([2 * 10**10] * 9, pa.timestamp("s")), "'t' has a time beyond the years 1678 to"),
+        (pa.array(range(9), pa.date32()), False),
+        (pa.array([False] * 9), False),
+        (pa.array(range(9), pa.timestamp("s")).cast(pa.int64()), True),
+        (pa.array([2 * 10**10] * 9, pa.timestamp("s")), False),  # beyond the years 1678 to 2262
     ],
 )
-def test_times_are_numbers_timestamps_or_durations(values, told, tmp_path):
+def test_times_are_numbers_timestamps_or_durations(values, is_time, tmp_path):
     rows = {"t": values, "x": np.arange(9.0), "u": np.full(9, 0.5)}
     pq.write_table(pa.table(rows), tmp_path / "a.parquet")
-    names = ("--observations", "x", "--actions", "u", "--time", "t", "--out", tmp_path / "out")
-    done = jbrep("data", "import", tmp_path / "a.parquet", *names)
-    if told:
-        assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
-        assert told in done.stderr
+    names = ("--observations", "x", "--actions", "u", "--time", "t")
+    if is_time:
+        imported(tmp_path / "a.parquet", *names)
     else:
-        assert done.exit_code == 0
+        assert "'t'" in not_imported(tmp_path / "a.parquet", *names)
 
 
 def test_words_of_polars_tell_episodes(tmp_path):
@@ -421,8 +404,8 @@ def test_logs_of_other_clocks_are_not_joined(tmp_path):
     (time,) = [name for name in slow if name.startswith("time")]
     slow[time] = [str(10 * float(each)) for each in slow[time]]
     third = write_csv(tmp_path / "c.csv", slow)
-    told = mistake("data", "import", first, second, third, *NAMED, "--out", tmp_path / "out")
-    assert "c.csv has another time from row to row than" in " ".join(told.split())
+    told = not_imported(first, second, third, *NAMED)
+    assert all(word in told for word in ("c.csv", "timestep"))
 
 
 def test_a_lerobot_data_set(tmp_path):
@@ -431,7 +414,7 @@ def test_a_lerobot_data_set(tmp_path):
     assert data.task.feature_names == ("shoulder.pos", "elbow.pos")
     np.testing.assert_array_equal(data["reward"][:9], np.arange(9))
     assert data.task.timestep == 1 / 30
-    assert "images are left out: observation.images.top" in told
+    assert "observation.images.top" in told
     assert "not used: timestamp, index, task_index" in told
     told, few = imported(tmp_path / "arm", "--observations", "observation.state.elbow*", out="few")
     assert few.task.feature_names == ("elbow.pos",)
@@ -493,11 +476,9 @@ def test_a_header_may_follow_many_comments_and_rows_may_all_be_apart(tmp_path):
     path.write_text(comments + "t,x,u\n0,1,2\n1,2,3\n2,2,3\n")
     how = ("--observations", "x", "--actions", "u", "--time", "t")
     assert len(imported(path, *how)[1]) == 2
-    told = mistake("data", "import", path, *how, "--gap", "0.5", "--out", tmp_path / "apart")
-    assert "has no step: an episode needs two rows" in told
+    assert "has no step" in not_imported(path, *how, "--gap", "0.5")
     path.write_text("t,x,u\n" + "5,1,2\n" * 9)
-    told = mistake("data", "import", path, *how, "--out", tmp_path / "still")
-    assert "; 8 rows at the time of the row before: left out" in told
+    assert "8 rows at the time of the row before" in not_imported(path, *how)
 
 
 def test_a_pause_within_an_episode_is_told(tmp_path):
@@ -510,63 +491,60 @@ def test_a_pause_within_an_episode_is_told(tmp_path):
     assert "the usual step" not in said
 
 
-def test_damaged_lerobot_data_sets_are_refused(tmp_path):
+def test_lerobot_data_sets_that_are_not_whole_are_refused(tmp_path):
     folder = lerobot_folder(tmp_path / "new", "v4.0")
-    done = jbrep("data", "import", folder, "--out", tmp_path / "out")
-    assert "layout v4.0: it must be v3.0 or v2.1" in done.output
-    (folder / "meta/info.json").write_text("{}")
-    done = jbrep("data", "import", folder, "--out", tmp_path / "out")
-    assert "isn't as LeRobot writes it: KeyError: 'codebase_version'" in done.output
+    assert "layout v4.0" in not_imported(folder)
+    known = {"codebase_version": "v3.0", "fps": 30, "features": {}, "total_frames": 10_000}
+    for told, problem in (({}, "codebase_version"), (known, "10,000"), (known | {"fps": 0}, "0.0")):
+        (folder / "meta/info.json").write_text(json.dumps(told))
+        assert problem in not_imported(folder)
     shutil.rmtree(folder / "data")
-    (folder / "meta/info.json").write_text(
-        json.dumps({"codebase_version": "v3.0", "fps": 30, "features": {}})
-    )
-    done = jbrep("data", "import", folder, "--out", tmp_path / "out")
-    assert "has no data/chunk-*/*.parquet" in done.output
-    assert not (tmp_path / "out").exists()
+    (folder / "meta/info.json").write_text(json.dumps(known))
+    assert "has no data/chunk-*/*.parquet" in not_imported(folder)
 
 
 def test_a_file_of_a_lerobot_data_set_that_lacks_a_column(tmp_path):
     folder = lerobot_folder(tmp_path / "arm")
     file = folder / "data/chunk-000/file-001.parquet"
     pq.write_table(pq.read_table(file).drop_columns("next.reward"), file)
-    done = mistake("data", "import", folder, "--out", tmp_path / "out")
-    assert "file-001.parquet has no column 'next.reward', unlike file-000.parquet" in done
+    assert "arm, row 21 has no 'next.reward'" in not_imported(folder)
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "told"),
+    ("name", "values"),
     [
-        ("next.reward", ["x"], "string, not float"),
-        ("action", [["a", "b"]], "list<element: string>, not fixed_size_list"),
-        ("observation.state", [1.0], "double, not fixed_size_list"),
-        ("episode_index", [{"a": 1}], "struct<a: int64>, not int64"),
+        ("next.reward", ["x"]),
+        ("action", [["a", "b"]]),
+        ("observation.state", [1.0]),
+        ("episode_index", [{"a": 1}]),
     ],
 )
-def test_a_file_of_other_types_is_refused(name, values, told, tmp_path):
+def test_a_file_of_other_types_is_refused(name, values, tmp_path):
     folder = lerobot_folder(tmp_path / "arm")
     file = folder / "data/chunk-000/file-001.parquet"
     table = pq.read_table(file)
     column = table.schema.names.index(name)
     pq.write_table(table.set_column(column, name, pa.array(values * len(table))), file)
-    done = mistake("data", "import", folder, "--out", tmp_path / "out")
-    assert f"arm, row 21: '{name}' has {told}" in done
+    told = not_imported(folder)
+    assert "arm, row 21" in told
+    assert repr(name) in told
 
 
-def test_a_footer_of_which_pyarrow_dies_is_refused(tmp_path):
-    """It ends the process where the sizes of a column are asked for."""
-    folder = lerobot_folder(tmp_path / "arm")
-    flip_bit(folder / "data/chunk-000/file-000.parquet", 10168)
-    done = mistake("data", "import", folder, "--out", tmp_path / "out")
-    assert "can't be read as a Parquet file: Definition level histogram size" in done
-
-
-@pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
-def test_a_bag_of_ros(kind, tmp_path):
-    path = write_bag(tmp_path / ("walk.bag" if kind == "bag" else "walk"), kind)
-    done = jbrep("data", "import", path, "--out", tmp_path / "out")
-    assert "topics with clocks of their own: give --rate" in done.output
-    assert "/joint_states.position.hip" in done.output
+@pytest.mark.parametrize(
+    ("kind", "compressed"),
+    [
+        *(("bag", ()), ("mcap", ()), ("db3", ())),
+        *(("bag", (each,)) for each in Writer1.CompressionFormat),
+        ("mcap", (CompressionMode.STORAGE, CompressionFormat.ZSTD)),
+        ("db3", (CompressionMode.FILE, CompressionFormat.ZSTD)),
+        ("db3", (CompressionMode.MESSAGE, CompressionFormat.ZSTD)),
+    ],
+)
+def test_a_bag_of_ros(kind, compressed, tmp_path):
+    path = tmp_path / ("walk.bag" if kind == "bag" else "walk")
+    write_bag(path, kind, compressed=compressed)
+    told = not_imported(path)
+    assert all(word in told for word in ("--rate", "/joint_states.position.hip"))
     names = ("--observations", "/joint_states.position.*", "--actions", "/arm/command.data")
     told, data = imported(path, *names, "--rate", "50", "--gap", "0.15")
     assert data.task.feature_names == ("joint_states.position.hip", "joint_states.position.knee")
@@ -596,9 +574,7 @@ def test_numbers_that_come_late_in_a_bag_are_missed_if_they_are_asked_for(tmp_pa
     path = write_bag(tmp_path / "walk", "mcap", silent=range(220))
     how = ("--actions", "/arm/command.data", "--rate", "50", "--observations")
     assert len(imported(path, *how, "/joint_states.header.stamp.sec")[1])
-    told = mistake("data", "import", path, *how, "/joint_states.*", "--out", tmp_path / "no")
-    assert "/joint_states.position" in told
-    assert "is in none of its first 200 messages" in told
+    assert "/joint_states.position" in not_imported(path, *how, "/joint_states.*")
 
 
 def test_messages_without_numbers_end_no_bag(tmp_path):
@@ -638,9 +614,7 @@ def test_topics_of_other_clocks_are_no_pauses_and_a_folder_is_no_bag_of_ros_1(tm
     told, _ = imported(path, *names, "--rate", "50", "--gap", "0.15")
     assert "pause" not in told  # commands come a tenth as often as joints
     path.rename(path := path.with_suffix(".bag"))
-    assert "is a folder, and files of ROS 1 end in .bag: rename it" in mistake(
-        "data", "import", path, "--out", tmp_path / "no"
-    )
+    assert "is a folder" in not_imported(path)
 
 
 def test_small_things_of_logs(tmp_path):
@@ -652,14 +626,14 @@ def test_small_things_of_logs(tmp_path):
     assert data["observation"][:, 0].tolist() == [0, np.float32(0.15)]
     table = pa.table({"t": [0, 1, 2, 3], "a": [None, [], [1.0, 2], [3.0, 4]], "u": [3e7] * 4})
     pq.write_table(table, tmp_path / "b.parquet")
-    with pytest.raises(InputError, match="row 0: 'a' has an empty cell: fill it"):
+    with pytest.raises(InputError, match="row 0: 'a' has an empty cell"):
         from_file(tmp_path / "b", tmp_path / "b.parquet", layout=named)
     pq.write_table(table.slice(2), tmp_path / "c.parquet")
     data = from_file(tmp_path / "c", tmp_path / "c.parquet", layout=named)
     assert data["observation"][0].tolist() == [1, 2]
     assert data.task.action_low[0] < 3e7 < data.task.action_high[0]
     path.write_text("t,a,u\n0,1,1\n,2,2\n")
-    with pytest.raises(InputError, match=r"'t' is empty, .* correct it, or leave the row out$"):
+    with pytest.raises(InputError, match=r"line 3: 't'"):
         from_file(tmp_path / "d", path, layout=named, missing="skip")
     with pytest.raises(InputError, match=r"has no actions: .*; it has t, a, u$"):
         from_file(tmp_path / "e", path, layout=Layout(time="t"))
@@ -668,94 +642,26 @@ def test_small_things_of_logs(tmp_path):
 def test_a_damaged_bag_is_refused(tmp_path):
     for name in ("a.bag", "a.mcap", "a.db3"):
         (tmp_path / name).write_bytes(b"nonsense" * 20)
-        done = jbrep("data", "import", tmp_path / name, "--rate", "9", "--out", tmp_path / "out")
-        assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
-        assert f"{name} can't be read as a bag" in done.stderr
+        assert f"{name} can't be read as a bag" in not_imported(tmp_path / name, "--rate", "9")
 
 
-def test_a_bag_reads_nothing_outside_itself(tmp_path):
-    path, out = write_bag(tmp_path / "walk", "db3"), tmp_path / "out"
+def test_a_bag_reads_nothing_outside_itself_and_opens_no_pipe(tmp_path):
+    path = write_bag(tmp_path / "walk", "db3")
     about, database = path / "metadata.yaml", path / "walk.db3"
     elsewhere = path / "..%2Felsewhere.db3"  # which SQLite takes for ../elsewhere.db3
     shutil.copy(database, tmp_path / "elsewhere.db3")
     elsewhere.touch()
     said = about.read_text()
     about.write_text(said.replace("walk.db3", elsewhere.name))
-    assert "can't be opened with any of %?# in it: rename it" in mistake(
-        "data", "import", path, "--out", out
-    )
+    assert elsewhere.name in not_imported(path)
     about.write_text(said)
-
-
-@pytest.mark.parametrize(
-    ("told", "made"),
-    [
-        (
-            "has the view schema",
-            "DROP TABLE schema; CREATE VIEW schema AS WITH RECURSIVE c(x) AS "
-            "(SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT max(x) AS schema_version FROM c",
-        ),
-        (
-            "has the computed column data",
-            "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, "
-            "timestamp, data AS (zeroblob(1000000000)))",
-        ),
-    ],
-)
-@pytest.mark.parametrize("is_squeezed", [False, True])
-def test_a_bag_with_a_database_that_computes_is_refused(told, made, is_squeezed, tmp_path):
-    path = write_bag(tmp_path / "walk", "db3")
-    database = path / "walk.db3"
-    with closing(sqlite3.connect(database)) as opened:
-        opened.executescript(made)
-    if is_squeezed:
-        squeezed = pa.compress(database.read_bytes(), "zstd", asbytes=True)
-        (path / "walk.db3.zstd").write_bytes(squeezed)
-        about = (path / "metadata.yaml").read_text()
-        about = about.replace("walk.db3", "walk.db3.zstd")
-        about = about.replace("compression_format: ''", "compression_format: zstd")
-        about = about.replace("compression_mode: ''", "compression_mode: file")
-        (path / "metadata.yaml").write_text(about)
-    assert f"{told}: a bag has plain tables only" in mistake(
-        "data", "import", path, "--out", tmp_path / "out"
-    )
-
-
-@pytest.mark.parametrize(
-    ("kind", "compressed", "told"),
-    [
-        *(("bag", (each,), "over 40 bytes") for each in Writer1.CompressionFormat),
-        ("mcap", (CompressionMode.STORAGE, CompressionFormat.ZSTD), "over 1 times its size"),
-        ("db3", (CompressionMode.FILE, CompressionFormat.ZSTD), "over 1 times its size"),
-        ("db3", (CompressionMode.MESSAGE, CompressionFormat.ZSTD), "over 40 bytes"),
-    ],
-)
-def test_a_compressed_bag_is_refused_where_it_unpacks_to_too_much(
-    kind, compressed, told, tmp_path, monkeypatch
-):
-    path = tmp_path / ("walk.bag" if kind == "bag" else "walk")
-    write_bag(path, kind, compressed=compressed)
-    names = ("--observations", "/joint_states.position.*", "--actions", "/arm/command.data")
-    _, data = imported(path, *names, "--rate", "50", "--gap", "0.15")
-    assert data.episodes["length"].tolist() == [52, 47]
-    monkeypatch.setattr(bag_reader, "_MOST_AT_ONCE", 40)
-    monkeypatch.setattr(bag_reader, "_MOST_TIMES", 1)
-    refused = mistake("data", "import", path, "--out", tmp_path / "no")
-    assert f"{path.name} can't be read as a bag: " in refused
-    assert f"unpacks to {told}" in refused
-
-
-@pytest.mark.parametrize("field", ["string[5000] data", "std_msgs/Float64[5000] data"])
-def test_a_message_of_very_many_parts_is_refused(field, tmp_path):
-    """For which rosbags would write code for minutes."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg(f"{field}\n", "my_msgs/msg/Long"))
-    with Writer(tmp_path / "walk", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topic = writer.add_connection("/long", "my_msgs/msg/Long", typestore=store)
-        writer.write(topic, 0, b"\0\1\0\0")
-    assert "has messages my_msgs/msg/Long of more than 4,096 parts" in mistake(
-        "data", "import", tmp_path / "walk", "--out", tmp_path / "out"
-    )
+    elsewhere.unlink()
+    for make in (lambda: database.symlink_to(tmp_path / "elsewhere.db3"), lambda: os.mkfifo(about)):
+        for each in (database, about):
+            each.unlink(missing_ok=True)
+        make()
+        about.exists() or about.write_text(said)
+        assert "must be a plain file" in not_imported(path)
 
 
 def test_the_page_on_logs_does_what_it_says(tmp_path, monkeypatch):
@@ -868,27 +774,28 @@ def test_rewards_see_what_the_data_set_has(tmp_path, rewards):
 
 
 def test_whole_numbers_that_floats_do_not_hold_are_refused(tmp_path):
+    """With their place: in tables, text, beside empty cells, in lists, arrays and bags."""
     table = {"t": np.arange(8) / 10, "x": (1 << 53) + np.arange(8), "u": np.zeros(8)}
     layout = Layout(observations=("x",), actions=("u",), time="t")
-    with pytest.raises(InputError, match=r"table, row 1: 'x' is 9007199254740993: whole numbers"):
+    with pytest.raises(InputError, match=r"table, row 1.*'x'.*9007199254740993"):
         from_table(tmp_path / "a", table, layout)
     table["x"] -= 1
-    with pytest.raises(InputError, match="row 2"):
-        from_table(tmp_path / "b", table, layout)
     path = write_csv(tmp_path / "a.csv", {name: each.tolist() for name, each in table.items()})
-    with pytest.raises(InputError, match=r"a\.csv, line 4: 'x' is 9007199254740993: whole numbers"):
-        from_file(tmp_path / "c", path, layout=layout)
+    with pytest.raises(InputError, match=r"a\.csv, line 4.*'x'.*9007199254740993"):
+        from_file(tmp_path / "b", path, layout=layout)
     table["x"] = pandas.array([5, None, *table["x"][2:]], dtype="Int64")
-    with pytest.raises(InputError, match=r"row 2: 'x' is 9007199254740993"):
-        from_table(tmp_path / "d", table, layout, missing="hold:1")
+    with pytest.raises(InputError, match=r"row 2.*'x'.*9007199254740993"):
+        from_table(tmp_path / "c", table, layout, missing="hold:1")
+    wide = pa.FixedSizeListArray.from_arrays(pa.array((1 << 53) + np.arange(16) // 2), 2)
+    with pytest.raises(InputError, match=r"row 1.*'x'.*9007199254740993"):
+        from_table(tmp_path / "d", {"t": table["t"], "x": wide, "u": table["u"]}, layout)
     rows = {"observations": (1 << 53) + np.arange(8)[:, None], "actions": np.zeros((8, 1))}
     np.savez(tmp_path / "a.npz", **rows, timeouts=np.arange(8) == 7)
-    told = r"a\.npz: episode 0, step 1: the observation is 9007199254740993: whole numbers"
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=r"a\.npz, row 1.*'observations'.*9007199254740993"):
         from_file(tmp_path / "e", tmp_path / "a.npz")
     bag = write_bag(tmp_path / "walk", "mcap", count=(1 << 53) - 9)
     names = Layout(observations=("/count.data",), actions=("/arm/command.data",), rate=100)
-    with pytest.raises(InputError, match=r"/count at 1700000000\.100 s: /count\.data is 90071"):
+    with pytest.raises(InputError, match=r"walk, message \d+.*'/count\.data'.*900719925474099"):
         from_file(tmp_path / "f", bag, layout=names)
 
 
@@ -910,8 +817,7 @@ def test_missing_readings_count_where_an_episode_has_no_whole_step(tmp_path):
 def test_empty_lines_are_no_rows_and_count_as_lines(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("# a\n\nt,x,u\n0,1,2\n\n1,2,3\n2,,3\n")
-    done = jbrep("data", "import", path, "--time", "t", "--actions", "u", "--out", tmp_path / "no")
-    assert "a.csv, line 7: 'x' is empty" in done.output
+    assert "a.csv, line 7: 'x'" in not_imported(path, "--time", "t", "--actions", "u")
     text = '# a\n\nt,x,u,note\n0,1,2,"a\nb"\n\n1,2,3,"c\n\nd"\n'
     for row, told in {
         "2,,3,e": "a.csv, line 10: 'x' is empty",
@@ -919,19 +825,11 @@ def test_empty_lines_are_no_rows_and_count_as_lines(tmp_path):
         "2,3,4,e,f": "a.csv, line 10: expected 4 columns, got 5",
     }.items():
         path.write_text(f"{text}{row}\n")
-        how = ("--observations", "x", "--actions", "u", "--time", "t", "--out", tmp_path / "no")
-        assert told in mistake("data", "import", path, *how)
+        how = ("--observations", "x", "--actions", "u", "--time", "t")
+        assert told in not_imported(path, *how)
     rows = "".join(f'{i},{i},2,"{i}\n"\n' for i in range(99_999))
     path.write_text(f"t,x,u,note\n{rows}9,fast,1,\n")
-    assert "line 200000, column 'x': invalid value" in mistake("data", "import", path, *how)
-
-
-def test_a_folder_of_lerobot_s_that_lacks_rows_is_refused(tmp_path):
-    folder = lerobot_folder(tmp_path / "le")
-    told = json.loads((folder / "meta/info.json").read_text())
-    (folder / "meta/info.json").write_text(json.dumps(told | {"total_frames": 10_000}))
-    said = mistake("data", "import", folder, "--out", tmp_path / "no")
-    assert re.search(r"has \d+ rows, and meta/info\.json says 10,000: download it whole", said)
+    assert "line 200000, column 'x'" in not_imported(path, *how)
 
 
 @pytest.fixture
@@ -974,8 +872,7 @@ def test_offsets_of_another_size_are_refused(far, tmp_path):
         else:
             info = json.loads((out / "meta/info.json").read_text())
             (out / "meta/info.json").write_text(json.dumps(info | {"feature_offsets": change}))
-        said = mistake("data", "import", out, "--out", tmp_path / "no")
-        assert "must be 2 numbers" in said
+        assert "offsets" in not_imported(out)
 
 
 def test_a_reward_of_ones_own_takes_nothing_of_the_files(tmp_path, rewards):
@@ -1012,66 +909,46 @@ def test_an_even_clock_keeps_what_came_after_the_last_action(rate, last, tmp_pat
     assert data["observation"][-1] == data["action"][-1] == last
 
 
-def test_whole_numbers_in_lists_are_refused_too(tmp_path):
-    wide = pa.FixedSizeListArray.from_arrays(pa.array((1 << 53) + np.arange(16) // 2), 2)
-    rows = {"x": wide, "u": np.zeros(8), "step": np.arange(8)}
-    with pytest.raises(InputError, match=r"row 1: 'x.0' is 9007199254740993: whole numbers"):
-        from_table(tmp_path / "a", rows, Layout(observations=("x",), actions=("u",)))
-
-
 def test_a_row_without_any_number_is_no_line_of_units(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("t,x,u\nNA,NA,NA\n1,2,3\n2,3,3\n")
-    assert "line 2: 't' is empty" in mistake(
-        *("data", "import", path, "--time", "t", "--actions", "u", "--missing", "skip"),
-        *("--out", tmp_path / "no"),
-    )
+    told = not_imported(path, "--time", "t", "--actions", "u", "--missing", "skip")
+    assert "line 2: 't'" in told
 
 
 def test_an_episode_without_a_name_is_refused(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("trip,x,u\na,1,2\na,2,3\n,3,3\nb,4,4\nb,5,4\n")
     names = ("--episode", "trip", "--actions", "u", "--missing", "skip")
-    said = mistake("data", "import", path, *names, "--out", tmp_path / "no")
-    assert "line 4: 'trip' has an empty cell: fill it" in said
+    assert "line 4: 'trip'" in not_imported(path, *names)
 
 
 def test_what_a_table_says_of_itself_may_be_anything(tmp_path):
     metadata = {"unit": "°".encode("latin-1"), "names": b"\xff", "offsets": b"many"}
     fields = [pa.field("x", pa.float64(), metadata=metadata), pa.field("action", pa.float64())]
-    columns = [[0.0, 1, 2], [0.5] * 3]
-    pq.write_table(pa.table(columns, pa.schema(fields)), tmp_path / "a.parquet")
+    table = pa.table([[0.0, 1, 2], [0.5] * 3], pa.schema(fields))
+    pq.write_table(table, tmp_path / "a.parquet")
     _, data = imported(tmp_path / "a.parquet", "--length", "9")
     assert [(each.name, each.unit) for each in data.task.features] == [("x", "\ufffd")]
-    told = pa.schema(fields[1:]).with_metadata({"jbrep": "[]"})
-    table = pa.table(columns[1:], told)
-    checksums = {"settings": hashlib.sha256(b"[]").hexdigest(), "columns": {}, "episodes": "0" * 64}
-    head = {"format": "jbrep table", "format_version": 2}
-    table = table.replace_schema_metadata(
-        {"jbrep": "[]", "jbrep checksums": json.dumps(head | checksums)}
-    )
-    pq.write_table(table, tmp_path / "b.parquet")
-    said = mistake("data", "import", tmp_path / "b.parquet", "--out", tmp_path / "no")
-    assert "b.parquet" in said
+    pq.write_table(table.replace_schema_metadata({"jbrep": "[]"}), tmp_path / "b.parquet")
+    assert "b.parquet" in not_imported(tmp_path / "b.parquet")
 
 
-@pytest.mark.parametrize("value", [{"fps": 10**400}, {"total_frames": math.inf}])
-def test_numbers_beyond_all_bounds_in_lerobot_s_own(value, tmp_path):
+def test_no_link_in_a_lerobot_data_set_is_followed(tmp_path):
     folder = lerobot_folder(tmp_path / "le")
-    told = json.loads((folder / "meta/info.json").read_text())
-    (folder / "meta/info.json").write_text(json.dumps(told | value))
-    assert "isn't as LeRobot writes it" in mistake(
-        "data", "import", folder, "--out", tmp_path / "no"
-    )
+    shutil.move(folder / "data/chunk-000", tmp_path / "elsewhere")
+    (folder / "data/chunk-000").symlink_to(tmp_path / "elsewhere")
+    assert "chunk-000 must be a plain file" in not_imported(folder)
 
 
 def test_a_column_too_wide_to_be_used_is_left_out(tmp_path):
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
         file["observations"], file["actions"] = np.zeros((3, 2)), np.zeros((3, 1))
         file["terminals"] = np.array([0, 0, 1])
-        file.create_dataset("lidar", data=np.ones((3, 5000), "i1"), compression="gzip")
+        file["lidar"] = np.ones((3, 5000), "i1")
     told, _ = imported(tmp_path / "a.hdf5")
-    assert "images are left out: lidar" in told
+    assert "lidar" in told
+    assert "lidar can't be used" in not_imported(tmp_path / "a.hdf5", "--observations", "lidar")
     rows = {"x": [0.0, 1], "action": [0.5, 0.5], "lidar": [np.zeros(5000)] * 2}
-    with pytest.raises(InputError, match="in the column 'lidar': it must be plain numbers"):
+    with pytest.raises(InputError, match="'lidar'"):
         from_table(tmp_path / "b", rows, Layout(length=9))

@@ -229,7 +229,7 @@ def import_data(
         missing = told.get("missing") or (task.missing if task else "") or ""
         opened = open_sources(source, known, missing)
         manifest = write(opened, out, task, **{} if task else told, reward=reward)
-    for note in opened.notes:
+    for note in opened.notes():
         say(note)
     for (noun, what), count in opened.changes().items():
         say(f"{counted(count, noun)} {what}")

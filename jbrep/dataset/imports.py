@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.dataset.formats import open_sources
-from jbrep.dataset.formats.episodes import Source
+from jbrep.dataset.formats.arrays import frame_in_python
+from jbrep.dataset.formats.frame import frame_of_table
+from jbrep.dataset.formats.source import Source
 from jbrep.dataset.formats.writer import write
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.reader import Dataset
@@ -41,12 +43,10 @@ def from_arrays(
         task: that they are of, or its name; made from the data alone if not given.
         source: where they come from, a few words; also the id of a task made from the data.
     """
-    from jbrep.dataset.formats.flat import source_of
-
     columns = {"observation": observations, "action": actions, "reward": rewards}
     columns |= {"terminated": terminations, "truncated": truncations}
     once = {"final_observation": final_observations, "seed": seeds}
-    return _written(folder, source_of(columns, once, source), task)
+    return _written(folder, Source(frame_in_python(columns, once, source)), task)
 
 
 def from_table(
@@ -68,10 +68,7 @@ def from_table(
         task: that the rows are of, or its name; made from the data alone if not given.
         source: where they come from, a few words; also the id of a task made from the data.
     """
-    from jbrep.dataset.formats.arrow import table_of  # imports pyarrow, an extra
-    from jbrep.dataset.formats.logs import source_of_table
-
-    opened = source_of_table(table_of(table, source), layout, missing)
+    opened = Source(frame_of_table(table, source), layout, missing)
     return _written(folder, opened, task, layout, missing)
 
 

@@ -6,10 +6,14 @@ import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from command import jbrep, mistake
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
+
+from jbrep.dataset import Dataset
+from jbrep.dataset.verify import find_problems
 
 RATE = 100
 TIMES = np.concatenate((np.arange(60), 500 + np.arange(60))) / RATE
@@ -19,6 +23,23 @@ PITCH = (800 * TIMES + 180) % 360 - 180
 VOLTS = np.sin(np.arange(120))
 STEPS = np.concatenate([np.arange(n) for n in (10, 8, 7)])
 ROWS = len(STEPS)
+
+
+def imported(path, *options, out="data"):
+    """What the command says, and the data set."""
+    folder = path.parent / out
+    done = jbrep("data", "import", path, *options, "--out", folder)
+    assert done.exit_code == 0, done.output
+    assert not list(find_problems(folder))
+    return done.output, Dataset(folder)
+
+
+def not_imported(path, *options):
+    """The line with which an import is refused; it leaves nothing."""
+    there = {*path.parent.iterdir()}
+    told = mistake("data", "import", path, *options, "--out", path.parent / "no")
+    assert {*path.parent.iterdir()} == there
+    return told
 
 
 def csv_rows(**changes):

@@ -5,7 +5,7 @@ import shutil
 from functools import cached_property
 from pathlib import Path
 
-from attacks import MALFORMED, Surface, command, digest, forked
+from attacks import Surface, command, digest, forked
 from click.testing import CliRunner
 from command import in_this_process
 from foreign import (
@@ -22,7 +22,7 @@ from small import brief
 from jbrep.cli import main
 from jbrep.collect import collect
 from jbrep.dataset import Dataset
-from jbrep.dataset.formats import export, open_source
+from jbrep.dataset.formats import export, open_sources
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.envs.names import environment_versions
@@ -175,45 +175,13 @@ def _run(algorithm, **settings):
 LAST = {"preset": "modern", "evaluation_episodes": 1, "final_episodes": 1, "evaluate_every": 32}
 
 
-def _import(to, path, options=(), **how):
-    """Of a file, with that of its episodes if it has one, or of a folder."""
+def _import(path, options=()):
+    """Of a file or a folder; a damaged one may take anything, or be taken for other data."""
 
     def act(folder):
         command("data", "import", path, *options, "--out", folder / "it")
 
-    def result(folder):
-        return Dataset(folder / "it").fingerprint
-
-    def copied(folder):
-        """What is damaged is a copy."""
-        there = folder / path.name
-        if not there.exists():
-            (shutil.copytree if path.is_dir() else shutil.copy)(path, there)
-            if to == "parquet":
-                shutil.copy(path.with_stem(f"{path.stem}-episodes"), folder)
-        return there
-
-    def files(folder):
-        there = copied(folder)
-        if to == "parquet":
-            return [there, there.with_stem(f"{there.stem}-episodes")]
-        found = there.rglob("*") if there.is_dir() else [there]
-        return sorted(each for each in found if each.is_file())
-
-    def read(folder):
-        """What the command makes: whole, or nothing."""
-        out = folder / "damaged" / "it"
-        try:
-            command_or_refusal("data", "import", copied(folder), *options, "--out", out)
-        finally:
-            left = [each.name for each in out.parent.iterdir()]
-            assert left in ([], ["it"]), left
-        dataset = Dataset(out)
-        found = dataset.fingerprint, dataset.manifest.settings.as_json()
-        shutil.rmtree(out)
-        return found
-
-    return Surface(act, result, files, read, **how)
+    return Surface(act, lambda folder: Dataset(folder / "it").fingerprint)
 
 
 def _export(to, dataset):
@@ -223,7 +191,7 @@ def _export(to, dataset):
     def result(folder):
         given = folder / f"it.{to}"
         given = next(given.rglob("main_data.hdf5")).parent if to == "minari" else given
-        known = [e.observation.tobytes() for e in open_source(str(given)).episodes()]
+        known = [e.observation.tobytes() for e in open_sources([str(given)]).episodes()]
         left = [path.name for path in folder.rglob(".*")]
         return known, left
 
@@ -352,12 +320,12 @@ SURFACES = {  # by name, what makes them of `Shared`
         "ppo", overrides={**SMALL, "n_steps": 8, "batch_size": 8}
     ),
     **{
-        f"import of {to}": lambda shared, to=to: _import(to, shared.exported(to))
+        f"import of {to}": lambda shared, to=to: _import(shared.exported(to))
         for to in ("npz", "parquet", "minari")
     },
     **{
-        f"import of {to}": lambda shared, to=to, write=write, told=told: _import(
-            to, write(shared.folder), told, harms=MALFORMED, has_checksums=False
+        f"import of {to}": lambda shared, write=write, told=told: _import(
+            write(shared.folder), told
         )
         for to, (write, told) in LOGS.items()
     },

@@ -4,72 +4,91 @@ Each message is a row that has the numbers of its topic only, at the time when i
 """
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
-from jbrep.dataset.formats.bag_reader import opened
-from jbrep.dataset.formats.episodes import digits_lost, label
-from jbrep.dataset.formats.flat import CHUNK
-from jbrep.dataset.formats.tables import Table
+from jbrep.dataset.formats.frame import CHUNK, Frame, check_plain, label_of
 from jbrep.dataset.layout import Layout
 from jbrep.envs.task import MAX_FEATURES
-from jbrep.records.record import MOST_WHOLE
+from jbrep.errors import InputError, refusing
 
 _TIME = "time"
 _DEEPEST = 8  # messages in messages
 _PEEKED = 200  # messages of a topic by which its numbers are known
+_OF_ADDRESSES = "%?#"  # rosbags gives SQLite an address, in which these stand for something else
+_Numbers = dict[str, Any]  # of a message, by the path to them; and when it was recorded [ns]
 
 
-class _Message(NamedTuple):
-    """The numbers of a message, if any."""
-
-    time: int  # when it was recorded [ns]
-    topic: str
-    numbers: dict[str, Any]  # by the path to them: bool, int or float
-
-    @property
-    def place(self) -> str:
-        """Where it stands, for messages."""
-        return f"{self.topic} at {self.time / 1e9:.3f} s"
-
-
-def open_table(given: str) -> Table:
-    """Open a .bag of ROS 1, an .mcap or .db3, or the folder of a bag of ROS 2."""
-    path, columns, unknown, late = Path(given), list[str](), list[str](), dict[str, str]()
-    with opened(path) as reader:
+def read(given: str) -> Frame:
+    """Read a .bag of ROS 1, an .mcap or .db3, or the folder of a bag of ROS 2."""
+    path, columns, unknown, late = Path(given), dict[str, None](), list[str](), dict[str, str]()
+    with _opened(path) as reader:
         for topic in sorted(reader.topics):
             messages = islice(_messages(reader, {topic}), _PEEKED)
-            known = dict.fromkeys(name for each in messages for name in each.numbers)
-            columns += known
-            if not known:
-                unknown.append(topic)
-    schema = pa.schema([(_TIME, pa.timestamp("ns")), *((name, pa.float64()) for name in columns)])
-    return Table(
-        given,
-        label(path.stem),
-        schema,
-        lambda names: _batches(path, schema, names, late),
+            known = dict.fromkeys(name for each in messages for name in each if name != _TIME)
+            columns |= known
+            unknown += [] if known else [topic]
+
+    def batches(names: list[str]) -> Iterator[pa.RecordBatch]:
+        with _opened(path) as reader:
+            topics = {t for t in reader.topics if any(name.startswith(f"{t}.") for name in names)}
+            messages = (each for each in _messages(reader, topics) if len(each) > 1)
+            while some := [*islice(messages, CHUNK)]:
+                for each in some:
+                    for name in each.keys() - columns - late.keys() - {_TIME}:
+                        at = f"{path}, at {each[_TIME] / 1e9:.3f} s"
+                        late[name] = f"{at}: {name} is in none of its first {_PEEKED} messages"
+                arrays = [pa.array([each.get(name) for each in some]) for name in names]
+                yield pa.RecordBatch.from_arrays(arrays, names=names)
+
+    kinds = {_TIME: pa.timestamp("ns"), **dict.fromkeys(columns, pa.float64())}
+    return Frame(
+        name=given,
+        label=label_of(path.stem),
+        schema=pa.schema(kinds.items()),
+        batches=batches,
         late=late,
         layout=Layout(time=_TIME),
         is_sparse=True,
+        place="message {}".format,
         notes=(f"no numbers known in {', '.join(unknown)}",) if unknown else (),
     )
 
 
-def _messages(reader: AnyReader, topics: set[str]) -> Iterator[_Message]:
-    """The messages of some topics, in the order of times."""
+@contextmanager
+def _opened(path: Path) -> Iterator[AnyReader]:
+    """A reader of a bag; types that the bag doesn't define are those of ROS 2."""
+    if path.is_dir() and path.suffix == ".bag":
+        raise InputError(f"{path} is a folder, and files of ROS 1 end in .bag: rename it")
+    check_plain(path)
+    for each in [*path.rglob("*")] or [path]:
+        address = str(each if ".db3" in each.name else each.relative_to(path))
+        if any(letter in address for letter in _OF_ADDRESSES):
+            raise InputError(f"{each} can't be opened with any of {_OF_ADDRESSES} in it: rename it")
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    with (
+        refusing(f"{path} can't be read as a bag"),  # whatever damaged bags raise
+        AnyReader([path], default_typestore=types) as reader,
+    ):
+        yield reader
+
+
+def _messages(reader: AnyReader, topics: set[str]) -> Iterator[_Numbers]:
+    """The numbers of messages of some topics, in the order of times."""
     connections = [each for each in reader.connections if each.topic in topics]
     for connection, time, raw in reader.messages(connections) if connections else ():
         try:
             message = reader.deserialize(raw, connection.msgtype)
         except KeyError:  # a type that nobody defines
             message = None
-        yield _Message(time, connection.topic, dict(_numbers(message, connection.topic, 0)))
+        yield {_TIME: time, **dict(_numbers(message, connection.topic, 0))}
 
 
 def _numbers(value: Any, name: str, depth: int) -> Iterator[tuple[str, Any]]:
@@ -77,11 +96,13 @@ def _numbers(value: Any, name: str, depth: int) -> Iterator[tuple[str, Any]]:
     value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, bool | int | float):
         yield name, value
+    elif depth == _DEEPEST:
+        return
     elif isinstance(value, np.ndarray | list | dict):
-        if len(value) <= MAX_FEATURES and depth < _DEEPEST:
-            for key, each in value.items() if isinstance(value, dict) else enumerate(value):
-                yield from _numbers(each, f"{name}.{key}", depth + 1)
-    elif depth < _DEEPEST:
+        pairs = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, each in pairs if len(value) <= MAX_FEATURES else ():
+            yield from _numbers(each, f"{name}.{key}", depth + 1)
+    else:
         for field in getattr(value, "__dataclass_fields__", ()):
             part, names = getattr(value, field), getattr(value, "name", ())
             if isinstance(part, np.ndarray) and _tell_apart(names, len(part)):
@@ -92,36 +113,5 @@ def _numbers(value: Any, name: str, depth: int) -> Iterator[tuple[str, Any]]:
 
 def _tell_apart(names: Any, count: int) -> bool:
     """Whether they are the different names of so many numbers, none of them empty."""
-    if not isinstance(names, list) or not all(isinstance(each, str) and each for each in names):
-        return False
-    return len({*names}) == len(names) == count
-
-
-def _batches(
-    path: Path, schema: pa.Schema, names: list[str], late: dict[str, str]
-) -> Iterator[pa.RecordBatch]:
-    """The messages with some of the numbers, some at a time; what is late is added, see `Table`."""
-    known = {*schema.names}
-    with opened(path) as reader:
-        topics = {t for t in reader.topics if any(name.startswith(f"{t}.") for name in names)}
-        messages = (each for each in _messages(reader, topics) if each.numbers)
-        while some := list(islice(messages, CHUNK)):
-            for message in some:
-                for name in message.numbers.keys() - known - late.keys():
-                    place = f"{path}, {message.place}"
-                    late[name] = f"{place}: {name} is in none of its first {_PEEKED} messages"
-            columns = [
-                pa.array([each.time for each in some], pa.timestamp("ns"))
-                if name == _TIME
-                else pa.array([_single(path, each, name) for each in some], pa.float64())
-                for name in names
-            ]
-            yield pa.RecordBatch.from_arrays(columns, names=names)
-
-
-def _single(path: Path, message: _Message, name: str) -> float | None:
-    """A number of a message, if it has it."""
-    number = message.numbers.get(name)
-    if isinstance(number, int) and abs(number) > MOST_WHOLE:
-        raise digits_lost(f"{path}, {message.place}: {name}", number)
-    return None if number is None else float(number)
+    are_words = isinstance(names, list) and all(isinstance(each, str) and each for each in names)
+    return are_words and len({*names}) == len(names) == count

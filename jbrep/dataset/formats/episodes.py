@@ -1,37 +1,25 @@
-"""Episodes that were made elsewhere, one by one, each checked."""
+"""Episodes: rows are cut into them, each is checked, and what is missing in it cut or held."""
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from jbrep.dataset.schema import UNKNOWN_SEED
-from jbrep.envs.task import MAX_FEATURES, Feature, Task
-from jbrep.errors import InputError, listed
-from jbrep.records.record import MOST_WHOLE
-from jbrep.text import slug
+from jbrep.dataset.formats.frame import ENDS
+from jbrep.dataset.layout import Layout
+from jbrep.dataset.schema import UNKNOWN_SEED, joined
+from jbrep.envs.task import MAX_EPISODE_STEPS, most_held
+from jbrep.errors import InputError
 
 Array = NDArray[Any]
-Rows = Mapping[str, Array]  # arrays with a row for each step, by the names of ALIASES
+Rows = Mapping[str, Array]  # a row for each step, by the keys of ALIASES, and time
+Counts = Counter[tuple[str, str]]  # of what was done: what it was done to, and what
 
-ALIASES = {  # what others call the columns; the dotted and the last ones are LeRobot's
-    "observation": ("observation", "observations", "observation.state"),
-    "action": ("action", "actions"),
-    "reward": ("reward", "rewards", "next.reward"),
-    "terminated": ("terminated", "terminations", "terminals"),
-    "truncated": ("truncated", "truncations", "timeouts"),
-    "next_observation": ("next_observation", "next_observations"),
-    "episode": ("episode", "episode_index"),
-    "step": ("step", "frame_index"),
-}
-ENDS = ("terminated", "truncated")
-WIDE = ("observation", "action", "next_observation", "final_observation")  # with many numbers a row
-WHOLE = ("episode", "step", "seed")
-CLOCKS = 0.01  # by which even clocks may differ and count as alike
-_IMAGE_AXES = 3  # height, width, colour
+MOST_RAW = 20_000_000  # rows of what is cut, or brought to another clock
+_PAUSE = 10  # usual steps
+_PAUSES = "ten times as long as the usual step or longer, within an episode: --gap ends it there"
 
 
 class Incoming(NamedTuple):
@@ -43,81 +31,107 @@ class Incoming(NamedTuple):
     reward: NDArray[np.float64]  # (n,), 0 where none is known
     final: NDArray[np.float64]  # (d,), after the last action
     terminated: bool
+    truncated: bool  # also where it was terminated; else it counts as truncated anyway
     seed: int
-    missing: int = 0  # numbers in whose place are others, or at which it was divided
-    truncated: bool = False  # also where it was terminated; else it counts as truncated anyway
     is_cut: bool = False  # whether its last step was left out, for want of a final observation
+    missing: int = 0  # numbers in whose place are others, or at which it was divided
 
 
-@dataclass(frozen=True)
-class Source:
-    """Data that were made elsewhere.
+def cut(
+    name: str, chunks: Iterable[Rows], layout: Layout, counts: Counts
+) -> Iterator[tuple[str, Rows]]:
+    """What each episode is called, and its rows, in bounded memory.
 
-    Attributes:
-        name: for messages and provenance.
-        label: for a task made from the data alone: its id.
-        episodes: reads them, from the first one on at each call.
-        task: that the source names; None if it names none that is known here.
-        features: for a task made from the data alone; numbered if there are none.
-        action_bounds: lower and upper ones, (k,) each; infinite where there are none.
-        max_episode_steps: for a task made from the data alone; the longest episode if None.
-        why_no_task: for the user.
-        rows: how many there are, if that is known.
-        has_rewards: whether they are known.
-        subtracted: offsets of features that observations lack already, (d,) or 0.
-        timestep: for a task made from the data alone [s].
-        notes: what is done to its columns, for the user.
-        changes: what was done to the rows that were read last, how often: what it is, and what
-            became of it.
-    """
-
-    name: str
-    label: str
-    episodes: Callable[[], Iterator[Incoming]]
-    task: Task | None = None
-    features: tuple[Feature, ...] = ()
-    action_bounds: tuple[Array, Array] | None = None
-    max_episode_steps: int | None = None
-    why_no_task: str = "it names no environment"
-    rows: int | None = None
-    has_rewards: bool = True
-    subtracted: Array | float = 0.0
-    timestep: float | None = None
-    notes: tuple[str, ...] = ()
-    changes: Callable[[], Mapping[tuple[str, str], int]] = dict
-
-
-def label(name: str) -> str:
-    """A name as the id of a task: of letters, digits, '.', '_' and '-'."""
-    return slug(name).strip("-.")[:100] or "imported"
-
-
-def whole_episode(where: str, given: Mapping[str, ArrayLike], **once: Any) -> Iterator[Incoming]:
-    """An episode from arrays of all its steps; none if no step is left.
+    An episode ends where it is terminated or truncated, before another number of an episode or,
+    without these, a step 0; where time goes back, or nothing comes for too long; and at the end.
 
     Args:
-        where: it is, for messages.
-        given: by the names of ALIASES; observations may have one row more than the rest: the final
-            one.
-        once: the final observation and the seed, where they are known.
+        name: of the source.
+        chunks: of rows, in order.
+        layout: which says how.
+        counts: of what was done, for the report.
     """
-    arrays = {name: plain(where, name, values) for name, values in given.items()}
-    observation = arrays["observation"]
-    if len(observation) == len(arrays["action"]) + 1 and "final_observation" not in once:
-        arrays["observation"], once["final_observation"] = observation[:-1], observation[-1]
-    check_arrays(where, arrays)
-    if "final_observation" in once:
-        check_arrays(where, {"final_observation": np.asarray(once["final_observation"])[None]})
-    for name in ENDS:
-        is_end = flags(where, name, arrays[name]) if name in arrays else np.zeros(0, bool)
-        if is_end[:-1].any():
-            step = np.flatnonzero(is_end)[0]
-            raise InputError(f"{where} goes on after its end at step {step}: divide it there")
-    yield from checked(where, arrays, once)
+    begun, known, number, usual = list[Rows](), set[int](), None, None
+    most = MOST_RAW if layout.rate or layout.length else MAX_EPISODE_STEPS
+
+    def whole(*parts: Rows) -> tuple[str, Rows]:
+        nonlocal number
+        rows, last = joined(parts), number
+        number = int(rows["episode"][0]) if "episode" in rows else len(known)
+        if number in known and not (layout.time and number == last):
+            raise InputError(
+                f"{name}: episode {number} goes on after its end, or comes in two parts: the "
+                "rows of an episode must stand together, and only its last one be an end"
+            )
+        known.add(number)
+        return f"{name}: episode {number}", rows
+
+    for rows in chunks:
+        if layout.time and not (layout.gap or layout.rate):
+            usual = usual or usual_step(np.diff(rows["time"]))  # by the first rows
+        begins = _begins(name, begun[-1] if begun else None, rows, layout.gap, usual, counts)
+        begin = 0
+        for end in np.flatnonzero(begins).tolist():
+            if begun or end:
+                yield whole(*begun, _some(rows, begin, end))
+            begun, begin = [], end
+        begun.append(_some(rows, begin, None))
+        if sum(len(each["action"]) for each in begun) > most:
+            raise InputError(f"{name} has an episode of over {most:,} steps: where does it end?")
+    if begun:
+        yield whole(*begun)
 
 
-def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incoming]:
-    """An episode, its parts checked; none if no step is left.
+def _some(rows: Rows, begin: int, end: int | None) -> Rows:
+    return {name: values[begin:end] for name, values in rows.items()}
+
+
+def _begins(
+    name: str,
+    before: Rows | None,
+    rows: Rows,
+    gap: float | None,
+    usual: float | None,
+    counts: Counts,
+) -> NDArray[np.bool_]:
+    """Whether an episode begins at each row."""
+    begins, last = np.zeros(len(rows["action"]), bool), before or _some(rows, 0, 1)
+    for flag in {*ENDS} & rows.keys():
+        if not np.isin(rows[flag], (0, 1)).all():
+            raise InputError(f"{name} has a {flag} that is neither true nor false, 0 nor 1")
+        ended = last[flag][-1:] if before else [False]
+        begins |= np.concatenate((ended, rows[flag][:-1])).astype(bool)
+    if "episode" in rows:
+        begins |= np.diff(rows["episode"], prepend=last["episode"][-1:]) != 0
+    elif "step" in rows:
+        begins |= rows["step"] == 0
+    if "time" in rows:
+        step = np.diff(rows["time"], prepend=last["time"][-1:])
+        back, silent, pause = step < 0, step > (gap or np.inf), step >= _PAUSE * (usual or np.inf)
+        counts["step", "back in time: an episode ends there"] += int((back & ~begins).sum())
+        counts["gap", f"of more than {gap} s: an episode ends there"] += int(
+            (silent & ~begins).sum()
+        )
+        counts["pause", _PAUSES] += int((pause & ~begins).sum())
+        begins |= back | silent
+    return begins
+
+
+def usual_step(steps: Array) -> float | None:
+    """The median of the steps on, if there are any."""
+    forward = steps[steps > 0]
+    return float(np.median(forward)) if len(forward) else None
+
+
+def stretches(mask: NDArray[np.bool_]) -> list[list[int]]:
+    """Begin and end of each stretch of rows that are true."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False]))))
+    pairs: list[list[int]] = edges.reshape(-1, 2).tolist()
+    return pairs
+
+
+def episode_of(where: str, rows: Rows, once: Mapping[str, Any]) -> Incoming | None:
+    """An episode, its parts checked; None if no step is left.
 
     Without the observation after its last action, the last step is left out, so that the
     observation before that becomes the final one: nothing is made up. What ended the episode came
@@ -128,105 +142,51 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
         rows: of its steps.
         once: its final observation, how it ended and its seed, where they are known.
     """
-    if not len(rows["action"]):
-        return
-    _check_steps(where, rows)
-    for name in {*WIDE} & rows.keys():
-        check_whole(rows[name], f"{where}, step {{}}: the {name.replace('_', ' ')}".format)
-    following = _following(where, rows)
-    final = once.get("final_observation", following)
-    observation = _flat(rows["observation"])
-    ended = {name: rows[name][-1] for name in ENDS if name in rows} | {**once}
-    terminated, truncated = (bool(ended.get(name, False)) for name in ENDS)
-    if final is None:
-        observation, last, terminated = observation[:-1], observation[-1], False
-    else:
-        last = _flat(np.asarray(final)[None])[0]
-    steps = len(observation)
-    if not steps:
-        return
-    if len(last) != observation.shape[1]:
+    observation, numbers = rows["observation"], np.arange(len(rows["action"]))
+    for step in np.flatnonzero(rows.get("step", numbers) != numbers)[:1]:
         raise InputError(
-            f"{where} has {observation.shape[1]} numbers in an observation, and {len(last)} in its "
-            "final one: the two must be equal"
-        )
-    seed = int(once.get("seed", UNKNOWN_SEED))
-    if not UNKNOWN_SEED <= seed < 1 << 63:
-        raise InputError(f"{where} has the seed {seed}: it must be from 0 to 2**63 - 1, or -1")
-    action = _flat(rows["action"][:steps])
-    reward = _flat(rows["reward"][:steps])[:, 0] if "reward" in rows else np.zeros(steps)
-    is_cut = final is None
-    how = {"terminated": terminated, "truncated": truncated, "is_cut": is_cut}
-    yield Incoming(where, observation, action, reward, last, seed=seed, **how)
-
-
-def _check_steps(where: str, rows: Rows) -> None:
-    """The steps of an episode are numbered without a gap, from 0."""
-    if "step" not in rows:
-        return
-    wrong = np.flatnonzero(rows["step"] != np.arange(len(rows["step"])))
-    if len(wrong):
-        first = wrong[0]
-        raise InputError(
-            f"{where} has step {rows['step'][first]} where step {first} was expected: its steps "
+            f"{where} has step {rows['step'][step]:g} where step {step} was expected: its steps "
             "must be numbered from 0 without a gap"
         )
-
-
-def _following(where: str, rows: Rows) -> Array | None:
-    """The observation after the last action, if that is known."""
-    if "next_observation" not in rows:
+    following = None
+    if "next_observation" in rows:
+        *_, following = after = rows["next_observation"]
+        _check_following(where, after[:-1].astype(np.float32), observation[1:].astype(np.float32))
+    final = once.get("final_observation", following)
+    ended = {name: rows[name][-1] for name in ENDS if name in rows} | {**once}
+    seed, steps = int(once.get("seed", UNKNOWN_SEED)), len(observation) - (final is None)
+    if not UNKNOWN_SEED <= seed < 1 << 63:
+        raise InputError(f"{where} has the seed {seed}: it must be from 0 to 2**63 - 1, or -1")
+    if not steps:
         return None
-    after, before = (
-        _flat(each) for each in (rows["next_observation"][:-1], rows["observation"][1:])
+    return Incoming(
+        where,
+        observation[:steps],
+        rows["action"][:steps],
+        rows["reward"][:steps] if "reward" in rows else np.zeros(steps),
+        observation[-1] if final is None else np.asarray(final, np.float64),
+        terminated=bool(ended.get("terminated", False)) and final is not None,
+        truncated=bool(ended.get("truncated", False)),
+        seed=seed,
+        is_cut=final is None,
     )
-    apart = (after.astype(np.float32) != before.astype(np.float32)) & ~(
-        np.isnan(after) & np.isnan(before)
-    )
+
+
+def _check_following(where: str, after: Array, before: Array) -> None:
+    """What was observed after each step is what was before the next, to 32 bits."""
+    apart = (after != before) & ~(np.isnan(after) & np.isnan(before))
     if apart.any():
-        step = np.argwhere(apart)[0, 0]
         raise InputError(
-            f"{where} has a gap after step {step}: the observation after that step isn't the one "
-            "before the next"
+            f"{where} has a gap after step {np.argwhere(apart)[0, 0]}: the observation after that "
+            "step isn't the one before the next"
         )
-    last: Array = rows["next_observation"][-1]
-    return last
-
-
-def check_whole(values: Array, told: Callable[[int], str]) -> None:
-    """Refuse whole numbers that floats of 64 bits don't hold.
-
-    Args:
-        values: with rows.
-        told: where they stand and what they are called, by the number of a row.
-    """
-    if values.dtype.kind not in "iu":
-        return
-    beyond = (values > MOST_WHOLE) | (values < -MOST_WHOLE)
-    if beyond.any():
-        first = np.argwhere(beyond)[0]
-        raise digits_lost(told(int(first[0])), int(values[tuple(first)]))
-
-
-def digits_lost(told: str, number: int) -> InputError:
-    """That a whole number is beyond `MOST_WHOLE`; told is where it stands and what it is called."""
-    return InputError(
-        f"{told} is {number}: whole numbers beyond 2**53 lose digits; subtract something from the "
-        "column first, or leave it out"
-    )
-
-
-def _flat(values: Array) -> NDArray[np.float64]:
-    """Flat rows, (n, ...) to (n, m)."""
-    return values.reshape(len(values), math.prod(values.shape[1:])).astype(np.float64)
 
 
 def single(where: str, what: str, values: NDArray[np.float64]) -> NDArray[np.float32]:
     """Numbers in single precision."""
     with np.errstate(over="ignore"):
         rounded = values.astype(np.float32)
-    if not np.isfinite(rounded).all():
-        step = np.argwhere(~np.isfinite(rounded))[0, 0]
+    for step in np.argwhere(~np.isfinite(rounded))[:1, 0]:
         raise InputError(
             f"{where} has a number in its {what} that isn't finite, or beyond 32 bits, at step "
             f"{step}: correct the data, leave the episode out, or give --missing"
@@ -234,93 +194,69 @@ def single(where: str, what: str, values: NDArray[np.float64]) -> NDArray[np.flo
     return rounded
 
 
-def plain(name: str, what: str, values: ArrayLike) -> Array:
-    """An array with rows."""
-    try:
-        array = np.asarray(values)
-    except ValueError:
-        raise InputError(
-            f"{name} has {what}s of different sizes: they must make one array"
-        ) from None
-    if not array.ndim:
-        raise InputError(f"{name} has a single {what}: it must be an array")
-    return array
+def count_missing(episode: Incoming) -> int:
+    """How many numbers of an episode aren't finite."""
+    parts = (episode.observation, episode.action, episode.reward, episode.final)
+    return sum(int((~np.isfinite(part)).sum()) for part in parts)
 
 
-def flags(where: str, name: str, values: Array) -> NDArray[np.bool_]:
-    """Whether each row is such an end."""
-    if not np.isin(values, (0, 1)).all():
-        raise InputError(f"{where} has a {name} that is neither true nor false, 0 nor 1")
-    return values.astype(bool)
-
-
-def check_names(name: str, roles: Iterable[str], columns: Iterable[str] = ()) -> None:
-    """Make sure that there is what every data set needs.
+def without_missing(episode: Incoming, missing: str) -> Iterator[Incoming]:
+    """An episode in which all numbers are finite, or the parts of it that are.
 
     Args:
-        name: of the source, for messages, as are its columns, unless they are named as roles.
-        roles: that columns have.
-        columns: all that there are.
+        episode: of n steps.
+        missing: skip leaves out the steps that aren't whole, and divides the episode there; hold:3
+            has the last number instead, for at most 3 steps in a row; empty if there must be none.
     """
-    roles = set(roles)
-    for needed in ("observation", "action"):
-        if needed not in roles:
-            has = listed([*columns] or sorted(roles)) or "no columns"
-            raise InputError(
-                f"{name} has no {needed}s: of a log name their columns, as in --actions torque "
-                f"--observations 'joint_*'; it has {has}"
-            )
-    if not roles & {*ENDS, "episode", "step"}:
-        raise InputError(
-            f"{name} doesn't tell where an episode ends: give it terminations and truncations, or "
-            "the number of the episode in each row; of a log name the column of times or episodes "
-            "(--time, --episode), or give the --length"
+    count = count_missing(episode) if missing else 0
+    episode = episode._replace(missing=count)
+    if count and missing == "skip":
+        yield from _whole_parts(episode)
+    else:
+        yield _held(episode, most_held(missing)) if count else episode
+
+
+def _whole_parts(episode: Incoming) -> Iterator[Incoming]:
+    """Those of consecutive steps from a whole observation to the next; the first has the count."""
+    seen = np.concatenate((episode.observation, episode.final[None]))
+    is_whole = np.asarray(np.isfinite(seen).all(axis=1))
+    steps = is_whole[:-1] & is_whole[1:] & np.isfinite(episode.reward)
+    steps &= np.isfinite(episode.action).all(axis=1)
+    for i, (begin, end) in enumerate(stretches(steps)):
+        is_last = end == len(steps)
+        yield episode._replace(
+            observation=seen[begin:end],
+            action=episode.action[begin:end],
+            reward=episode.reward[begin:end],
+            final=seen[end],
+            terminated=episode.terminated and is_last,
+            truncated=episode.truncated and is_last,
+            seed=episode.seed if begin == 0 else UNKNOWN_SEED,
+            missing=episode.missing if i == 0 else 0,
         )
 
 
-def check_lengths(name: str, lengths: Mapping[str, int], unit: str = "rows") -> None:
-    """Make sure that all columns are equally long."""
-    first, expected = next(iter(lengths.items()), ("", 0))
-    for what, length in lengths.items():
-        if length != expected:
-            raise InputError(
-                f"{name} has {expected:,} {unit} of {first}s, and {length:,} of {what}s: the "
-                "two must be equal"
-            )
-
-
-def check_arrays(name: str, arrays: Mapping[str, Any], unit: str = "rows") -> None:
-    """`check_lengths` and `check_kind` of arrays, or of what has their types and shapes."""
-    check_lengths(name, {what: (*each.shape, 0)[0] for what, each in arrays.items()}, unit)
-    for what, each in arrays.items():
-        check_kind(name, what, each.dtype, each.shape[1:])
-
-
-def check_kind(name: str, what: str, dtype: np.dtype[Any], row: Sequence[int] = ()) -> None:
-    """Make sure that a column holds what can be imported.
-
-    Args:
-        name: of the source.
-        what: the column.
-        dtype: of its values.
-        row: shape of one of its rows.
-    """
-    shape = f"{what}s of shape {tuple(row)}"
-    if dtype.kind not in "fiub":
+def _held(episode: Incoming, most: int) -> Incoming:
+    """The episode with the last numbers in place of missing ones; an action has none."""
+    for step in np.argwhere(~np.isfinite(episode.action))[:1, 0]:
         raise InputError(
-            f"{name} has {what}s of type {dtype}: they must be arrays of plain numbers"
+            f"{episode.where} lacks its action at step {step}, which can't be held: leave the "
+            "episode out, or give --missing skip"
         )
-    if what not in WIDE and math.prod(row) != 1:
-        raise InputError(f"{name} has {shape} in each row: it must be one number")
-    if len(row) >= _IMAGE_AXES or (len(row) > 1 and dtype == np.uint8):
-        raise InputError(f"{name} has images, {shape}: only features are possible")
-    if math.prod(row) > MAX_FEATURES:
-        raise InputError(f"{name} has {shape}: at most {MAX_FEATURES:,} numbers are possible")
-    if math.prod(row) == 0:
-        raise InputError(f"{name} has {shape}: there must be at least one number")
-    if what in WHOLE and dtype.kind not in "iu":
-        raise InputError(f"{name} has {what}s of type {dtype}: they must be whole numbers")
-    if what == "action" and dtype.kind != "f":
+    seen = np.concatenate((episode.observation, episode.final[None]))
+    reward = np.concatenate(([0.0], episode.reward))  # with the observation after it
+    rows = np.column_stack((seen, reward))
+    number = np.arange(len(rows))[:, None]
+    last = np.maximum.accumulate(np.where(np.isfinite(rows), number, -1))
+    for step, column in np.argwhere((last < 0) | (number - last > most))[:1]:
+        what = "the reward" if column == seen.shape[1] else f"feature {column}"
+        is_first = last[step, column] < 0
+        why = "with none before to hold" if is_first else f"beyond hold:{most} of the last one"
         raise InputError(
-            f"{name} has actions of type {dtype}: only continuous ones are possible, floats"
+            f"{episode.where}: {what} is missing at step {step}, {why}: give --missing skip, hold "
+            "it for longer, or leave the episode out"
         )
+    filled = np.take_along_axis(rows, last, axis=0)
+    return episode._replace(
+        observation=filled[:-1, :-1], final=filled[-1, :-1], reward=filled[1:, -1]
+    )

@@ -5,111 +5,103 @@ Images and videos are left out. Version 2.1 has the same columns, a file for eac
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
-from jbrep.dataset.formats.episodes import label
-from jbrep.dataset.formats.parquet import batches_of, check_sizes, reading
-from jbrep.dataset.formats.tables import NAMES, PEEKED, Table, width, with_offsets, with_widths
+from jbrep.dataset.formats.arrays import column_of
+from jbrep.dataset.formats.frame import PEEKED, About, Frame, check_plain, label_of, measured, width
+from jbrep.dataset.formats.parquet import batches_of, reading
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
 from jbrep.errors import InputError, refusing
 from jbrep.progress import Progress
-from jbrep.records.storage import publish, read_file, unfinished, write_whole
+from jbrep.records.storage import publish, unfinished
 
-EPISODE_BYTES = 1 << 10  # in the table of episodes
+Array = NDArray[Any]
+
 INFO = "meta/info.json"
 _VERSIONS = ("v3", "v2")
-_FILE_ROWS = 1 << 20  # of what is written
-_CHUNK_FILES = 1000
 _IMAGES = ("image", "video")
 _OFFSETS = "feature_offsets"  # of jbrep's own
 _STATE = "observation.state"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-_NUMBERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+_EPISODES = f"meta/episodes/{_DATA.removeprefix('data/')}"
+_INDEX = "__index_level_0__"  # pandas reads the tasks by their names
+_OF_PANDAS = {
+    "index_columns": [_INDEX],
+    "column_indexes": [],
+    "columns": [
+        {"name": name, "field_name": field, "pandas_type": kind, "numpy_type": dtype}
+        for name, field, kind, dtype in (
+            ("task_index", "task_index", "int64", "int64"),
+            (None, _INDEX, "unicode", "object"),
+        )
+    ],
+    "pandas_version": "2",
+}
 
 
-def open_table(given: str) -> Table:
-    """Open a data set by its folder."""
+def read(given: str) -> Frame:
+    """Read a data set by its folder."""
     folder = Path(given)
-    info = _info(folder / INFO)
+    check_plain(folder)
+    info = folder / INFO
+    with refusing(f"{info} isn't as LeRobot writes it"):
+        told = json.loads(info.read_bytes())
+        version, fps = str(told["codebase_version"]), float(told["fps"])
+        features = {str(name): dict(each) for name, each in told["features"].items()}
+        frames = int(told["total_frames"]) if "total_frames" in told else None
+        offsets = tuple(float(each) for each in told.get(_OFFSETS, ()))
+        images = [name for name, each in features.items() if each["dtype"] in _IMAGES]
+    if not version.startswith(_VERSIONS):
+        raise InputError(f"{info} is of LeRobot's layout {version}: it must be v3.0 or v2.1")
+    if not 0 < fps < np.inf:
+        raise InputError(f"{info} has {fps} frames a second")
     paths = sorted(folder.glob("data/*/*.parquet"))
     if not paths:
         raise InputError(f"{given} has no data/chunk-*/*.parquet: download it whole")
-    rows, schema = 0, None
+    with reading(paths[0]), pq.ParquetFile(paths[0]) as file:
+        schema = measured(file.schema_arrow, next(file.iter_batches(PEEKED), None))
+    rows = 0
     for path in paths:
-        with reading(path), pq.ParquetFile(path) as file:
-            check_sizes(str(path), file.metadata, file.schema_arrow)
-            schema = schema or with_widths(file.schema_arrow, next(file.iter_batches(PEEKED), None))
-            if lacking := [n for n in schema.names if n not in file.schema_arrow.names]:
-                raise InputError(f"{path} has no column {lacking[0]!r}, unlike {paths[0].name}")
-            rows += file.metadata.num_rows
-    assert schema is not None
-    if info["frames"] not in (None, rows):
+        with reading(path):
+            rows += pq.read_metadata(path).num_rows
+    if frames not in (None, rows):
         raise InputError(
-            f"{given} has {rows:,} rows, and {INFO} says {info['frames']:,}: download it whole"
+            f"{given} has {rows:,} rows, and {INFO} says {frames:,}: download it whole"
         )
-    known = info["features"]
-    schema = _named(schema, known)
-    if (offsets := info["offsets"]).ndim and _STATE in schema.names:
-        size = width(schema.field(_STATE).type) or 1
-        if offsets.shape != (size,) or not np.isfinite(offsets).all():
-            raise InputError(f"{given}: {_OFFSETS} in {INFO} must be {size} numbers")
-        schema = with_offsets(schema, _STATE, offsets.tolist())
-    images = [name for name, each in known.items() if each["dtype"] in _IMAGES]
-    seen = [n for n in known if n.startswith("observation.") and n not in images]
-    return Table(
-        given,
-        label(folder.resolve().name),
-        schema,
-        lambda columns: _batches(paths, columns),
+    about = {each.name: About(names=_names(each, features.get(each.name, {}))) for each in schema}
+    if offsets and _STATE in about:
+        about[_STATE] = about[_STATE]._replace(offsets=offsets)
+    seen = [name for name in features if name.startswith("observation.") and name not in images]
+    return Frame(
+        name=given,
+        label=label_of(folder.resolve().name),
+        schema=schema,
+        batches=lambda columns: batches_of(paths, columns),
         rows=rows,
+        about=about,
+        unusable=dict.fromkeys(images, "images"),
         layout=Layout(observations=tuple(seen), actions=("action",)),
-        timestep=1 / info["fps"],
-        notes=(f"images are left out: {', '.join(images)}",) if images else (),
+        timestep=1 / fps,
     )
 
 
-def _info(path: Path) -> dict[str, Any]:
-    """What the data set says of itself, as far as it is used."""
-    raw = read_file(path)
-    errors = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
-    with refusing(f"{path} isn't as LeRobot writes it", errors):
-        info = json.loads(raw)
-        version, fps = str(info["codebase_version"]), float(info["fps"])
-        frames = int(info["total_frames"]) if "total_frames" in info else None
-        known = {str(name): dict(each) for name, each in info["features"].items()}
-        known = {name: each | {"dtype": str(each["dtype"])} for name, each in known.items()}
-        offsets = np.array(info.get(_OFFSETS, 0.0), np.float64)
-    if not version.startswith(_VERSIONS):
-        raise InputError(f"{path} is of LeRobot's layout {version}: it must be v3.0 or v2.1")
-    if not 0 < fps < np.inf:
-        raise InputError(f"{path} has {fps} frames a second")
-    return {"fps": fps, "frames": frames, "features": known, "offsets": offsets}
-
-
-def _named(schema: pa.Schema, known: Mapping[str, Any]) -> pa.Schema:
-    """The schema with the names of the numbers in lists."""
-    for i, each in enumerate(schema):
-        names = known.get(each.name, {}).get("names")
-        if isinstance(names, dict):  # as in {"motors": [...]}
-            names = next(iter(names.values()), None)
-        fits = isinstance(names, list) and len(names) == (width(each.type) or 1)
-        if fits and all(isinstance(name, str) for name in names):
-            lines = "\n".join(names).encode(errors="replace")
-            schema = schema.set(i, each.with_metadata({NAMES: lines}))
-    return schema
-
-
-def _batches(paths: list[Path], columns: list[str]) -> Iterator[pa.RecordBatch]:
-    for path in paths:
-        yield from batches_of(path, columns)
+def _names(column: pa.Field, feature: dict[str, Any]) -> tuple[str, ...]:
+    """The names of the numbers of a column, if they are told."""
+    names = feature.get("names")
+    if isinstance(names, dict):  # as in {"motors": [...]}
+        names = next(iter(names.values()), None)
+    if not isinstance(names, list) or len(names) != (width(column.type) or 1):
+        return ()
+    return tuple(names) if all(isinstance(each, str) for each in names) else ()
 
 
 def write(dataset: Dataset, out: Path) -> str:
@@ -119,116 +111,75 @@ def write(dataset: Dataset, out: Path) -> str:
     which an episode ends: what is exported lacks them.
     """
     fps = 1 / dataset.task.known_timestep
+    fps = round(fps) if abs(fps - round(fps)) < 1e-6 * fps else fps
     with unfinished(out) as partial:
-        fps = round(fps) if abs(fps - round(fps)) < 1e-6 * fps else fps
-        (partial / "meta").mkdir(parents=True)
-        files = _write_steps(dataset, partial, fps)
-        _write_meta(dataset, partial, files, fps)
+        for path in (_DATA, _EPISODES):
+            (partial / path.format(chunk_index=0, file_index=0)).parent.mkdir(parents=True)
+        _write_steps(dataset, partial / _DATA.format(chunk_index=0, file_index=0), fps)
+        _write_meta(dataset, partial, fps)
         publish(partial, out)
     return f"LeRobotDataset({out.name!r}, root={str(out)!r})"
 
 
-def _features(dataset: Dataset) -> dict[str, Any]:
-    task = dataset.task
-    actions = [f"action_{i}" for i in range(task.action_size)]
-    wide = {_STATE: list(task.feature_names), "action": actions}
-    features = {n: {"dtype": "float32", "shape": [len(v)], "names": v} for n, v in wide.items()}
-    single = {"next.reward": "float32"} if "reward" in dataset.columns else {}
-    single |= {name: "float32" if name == "timestamp" else "int64" for name in _NUMBERS}
-    return features | {n: {"dtype": t, "shape": [1], "names": None} for n, t in single.items()}
+def _columns(dataset: Dataset, begin: int, end: int, fps: float) -> dict[str, Array]:
+    """Some rows, by LeRobot's names."""
+    rows = slice(begin, end)
+    wide = {_STATE: dataset["observation"][rows], "action": dataset["action"][rows]}
+    rewards = {"next.reward": dataset["reward"][rows]} if "reward" in dataset.columns else {}
+    step, index = dataset["step"][rows].astype(np.int64), np.arange(begin, end)
+    return {
+        **wide,
+        **rewards,
+        "timestamp": (step / fps).astype(np.float32),
+        "frame_index": step,
+        "episode_index": dataset["episode"][rows].astype(np.int64),
+        "index": index,
+        "task_index": 0 * index,
+    }
 
 
-def _write_steps(dataset: Dataset, folder: Path, fps: float) -> list[int]:
-    """The rows, in files of whole episodes; returns the number of the file of each episode."""
-    lengths, files, rows = dataset.episodes["length"].tolist(), list[int](), 0
-    for length in lengths:
-        rows += length
-        files.append(files[-1] if files else 0)
-        if rows > _FILE_ROWS and rows > length:
-            files[-1], rows = files[-1] + 1, length
-    schema = pa.schema(
-        pa.field(name, pa.list_(kind, each["shape"][0]) if each["shape"] != [1] else kind)
-        for name, each in _features(dataset).items()
-        for kind in [pa.float32() if each["dtype"] == "float32" else pa.int64()]
-    )
-    writer, begin = None, 0
-    for number, length in enumerate(Progress(lengths, unit="episode", desc=folder.name)):
-        if number == 0 or files[number] != files[number - 1]:
-            if writer:
-                writer.close()
-            chunk, file = divmod(files[number], _CHUNK_FILES)
-            path = folder / _DATA.format(chunk_index=chunk, file_index=file)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            writer = pq.ParquetWriter(path, schema)
-        episode, steps = dataset.episode(number), np.arange(length)
-        columns = {"timestamp": steps / fps, "frame_index": steps, "index": begin + steps}
-        columns |= {"episode_index": np.full(length, number), "task_index": np.zeros(length)}
-        columns |= {"next.reward": episode["reward"]} if "next.reward" in schema.names else {}
-        wide = {_STATE: episode["observation"], "action": episode["action"]}
-        columns |= {name: values[:, 0] for name, values in wide.items()}  # where it is one number
-        arrays = [
-            pa.FixedSizeListArray.from_arrays(wide[each.name].ravel(), each.type.list_size)
-            if pa.types.is_fixed_size_list(each.type)
-            else pa.array(columns[each.name].astype(each.type.to_pandas_dtype()))
-            for each in schema
-        ]
-        assert writer is not None
-        writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
-        begin += length
-    if writer:
-        writer.close()
-    return files
+def _write_steps(dataset: Dataset, path: Path, fps: float) -> None:
+    def table(begin: int, end: int) -> pa.Table:
+        columns = _columns(dataset, begin, end, fps)
+        return pa.table({name: column_of(values) for name, values in columns.items()})
+
+    ends = accumulate((shard.rows for shard in dataset.manifest.shards), initial=0)
+    with pq.ParquetWriter(path, table(0, 0).schema) as writer:
+        for begin, end in Progress([*pairwise(ends)], unit="shard", desc=path.name):
+            writer.write_table(table(begin, end))
 
 
-def _write_meta(dataset: Dataset, folder: Path, files: list[int], fps: float) -> None:
-    lengths, name = dataset.episodes["length"], dataset.task.name
+def _write_meta(dataset: Dataset, folder: Path, fps: float) -> None:
+    lengths, task = dataset.episodes["length"].astype(np.int64), dataset.task
     ends, count = np.cumsum(lengths), len(lengths)
-    chunks, numbers = np.divmod(files, _CHUNK_FILES)
+    places = [
+        f"{part}/{what}_index" for part in ("data", "meta/episodes") for what in ("chunk", "file")
+    ]
     episodes = {
         "episode_index": np.arange(count),
-        "tasks": [[name]] * count,
-        "length": lengths.astype(np.int64),
-        "data/chunk_index": chunks,
-        "data/file_index": numbers,
-        "dataset_from_index": ends - lengths,
-        "dataset_to_index": ends,
-        "meta/episodes/chunk_index": np.zeros(count, np.int64),
-        "meta/episodes/file_index": np.zeros(count, np.int64),
+        "tasks": [[task.name]] * count,
+        "length": lengths,
     }
-    path = folder / "meta/episodes/chunk-000/file-000.parquet"
-    path.parent.mkdir(parents=True)
-    pq.write_table(pa.table(episodes), path)
-    index = "__index_level_0__"  # pandas reads the tasks by their names
-    kinds = {"task_index": ("task_index", "int64", "int64"), index: (None, "unicode", "object")}
-    keys = ("name", "pandas_type", "numpy_type")
-    columns = [
-        {"field_name": n, "metadata": None, **dict(zip(keys, k, strict=True))}
-        for n, k in kinds.items()
-    ]
-    pandas = {"index_columns": [index], "column_indexes": [], "columns": columns}
-    tasks = pa.table({"task_index": [0], index: [name]})
-    tasks = tasks.replace_schema_metadata({"pandas": json.dumps({**pandas, "pandas_version": "2"})})
+    episodes |= {"dataset_from_index": ends - lengths, "dataset_to_index": ends}
+    episodes |= dict.fromkeys(places, np.zeros(count, np.int64))
+    pq.write_table(pa.table(episodes), folder / _EPISODES.format(chunk_index=0, file_index=0))
+    tasks = pa.table({"task_index": [0], _INDEX: [task.name]})
+    tasks = tasks.replace_schema_metadata({"pandas": json.dumps(_OF_PANDAS)})
     pq.write_table(tasks, folder / "meta/tasks.parquet")
-    stats = {}
-    for column, of in ((_STATE, "observation"), ("action", "action")):
+    names = {_STATE: list(task.feature_names)}
+    names["action"] = [f"action_{i}" for i in range(task.action_size)]
+    features, stats = dict[str, Any](), dict[str, Any]()
+    for name, values in _columns(dataset, 0, 0, fps).items():
+        shape = list(values.shape[1:]) or [1]
+        features[name] = {"dtype": str(values.dtype), "shape": shape, "names": names.get(name)}
+    for name, of in ((_STATE, "observation"), ("action", "action")):
         (low, high), (mean, std) = extrema(dataset[of].chunks()), mean_and_std(dataset[of].chunks())
         told = {"min": low, "max": high, "mean": mean, "std": std, "count": [len(dataset)]}
-        stats[column] = {what: np.asarray(each).tolist() for what, each in told.items()}
-    write_whole(folder / "meta/stats.json", json.dumps(stats, indent=4).encode())
-    info = {
-        "codebase_version": "v3.0",
-        "robot_type": None,
-        "total_episodes": count,
-        "total_frames": len(dataset),
-        "total_tasks": 1,
-        "chunks_size": _CHUNK_FILES,
-        "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
-        "fps": fps,
-        "splits": {"train": f"0:{count}"},
-        "data_path": _DATA,
-        "video_path": None,
-        "features": _features(dataset),
-        _OFFSETS: dataset.task.offset.tolist(),
-    }
-    write_whole(folder / INFO, json.dumps(info, indent=4).encode())
+        stats[name] = {what: np.asarray(each).tolist() for what, each in told.items()}
+    info = {"codebase_version": "v3.0", "robot_type": None, "fps": fps, "features": features}
+    info |= {"total_episodes": count, "total_frames": len(dataset), "total_tasks": 1}
+    info |= {"splits": {"train": f"0:{count}"}, "data_path": _DATA, "video_path": None}
+    info |= {"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
+    info[_OFFSETS] = task.offset.tolist()
+    for path, content in {"meta/stats.json": stats, INFO: info}.items():
+        (folder / path).write_text(json.dumps(content, indent=4))

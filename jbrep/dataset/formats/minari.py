@@ -1,33 +1,30 @@
-"""Data sets in Minari's HDF5 storage, with the environment that it recovers.
+"""Data sets in Minari's storage, with the environment that it recovers.
 
 They may be strangers': nothing outside their folder is read, and no environment is made with
-arguments that may name files. What jbrep exports has the checksums of its files beside them.
+arguments that may name files.
 """
 
 import copy
-import hashlib
 import json
 import os
 import re
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import minari
-import minari.dataset.minari_storage as storages
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.spaces.utils import flatten
+from gymnasium.spaces.utils import flatdim, flatten
 from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
 from minari.namespace import NAMESPACE_METADATA_FILENAME
-from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
-import jbrep.jitterbug.simulation  # noqa: F401  Minari makes the environment: load MuJoCo before
-from jbrep.dataset.formats.episodes import Incoming, Source, check_kind, label, whole_episode
+from jbrep.dataset.formats.arrays import frame_of_steps, joined
+from jbrep.dataset.formats.frame import About, Frame, check_plain, label_of
 from jbrep.dataset.formats.hdf5 import opened
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.rewards import without_range
@@ -36,81 +33,68 @@ from jbrep.envs.description import describe
 from jbrep.envs.names import spec_of
 from jbrep.envs.probe import features_of
 from jbrep.envs.task import Task
-from jbrep.errors import DamageError, InputError, kind_and_line, listed, refusing
+from jbrep.errors import InputError, kind_and_line, listed, refusing
 from jbrep.progress import Progress
-from jbrep.records.document import Document, read_document
-from jbrep.records.record import Finite, Sha256
 from jbrep.records.storage import (
+    check_space,
     exists,
     make_folder,
     publish,
-    read_file,
     unfinished,
     write_whole,
 )
 
 Array = NDArray[Any]
-_ROOT = "MINARI_DATASETS_PATH"  # Minari takes the folder of its data sets from there only
-_METADATA, _CHECKSUMS = "metadata.json", "jbrep.json"
+
+_ROOT = "MINARI_DATASETS_PATH"
+_METADATA = "metadata.json"
+_OWN = "jbrep"  # in that of what was exported: what Minari has no place for
+_NAMES = {"reward": "rewards", "terminated": "terminations", "truncated": "truncations"}
 _WORD = re.compile(r"[\w-]{1,40}")
-EPISODE_BYTES = 1 << 14  # that HDF5 takes for each episode besides its rows
+_EPISODE_BYTES = 1 << 14  # that HDF5 takes for each episode besides its rows
 
 
-class Checksums(Document, frozen=True, kw_only=True):
-    """jbrep.json: the SHA-256 of each file that was exported, by its name, and what Minari lacks.
-
-    That is the offsets of features, (d,), and whether the rewards aren't the environment's.
-    """
-
-    format = "jbrep export"
-    format_version = 2
-
-    files: Mapping[str, Sha256]
-    offsets: tuple[Finite, ...] = ()
-    own_rewards: Literal[True] | UnsetType = UNSET
-
-
-def open_source(given: str) -> Source:
-    """Open a Minari data set.
-
-    Args:
-        given: its folder, or its id, to be looked for where Minari keeps its data sets.
-
-    Raises:
-        DamageError: it isn't what jbrep exported.
-    """
+def read(given: str) -> Frame:
+    """Read a Minari data set by its folder, or its id in the folder where Minari keeps them."""
     folder = _folder(given)
-    exported = _check_files(folder)
-    metadata = _metadata(folder)
-    storage = _storage(given, folder)
-    name = f"Minari {metadata.get('dataset_id', given)}"
-    features = tuple(features_of(name, storage.observation_space))
-    actions = _continuous(name, storage.action_space)
-    env_id, arguments, limit = _environment(metadata)
-    task, why_not = _describe(env_id, arguments, limit)
-    identity = env_id or label(name)
-    if task and (task.size, task.action_size) != (len(features), actions.low.size):
-        task, identity, why_not = None, label(name), f"{env_id} has other sizes"
-    if task and exported and exported.own_rewards:
-        task = without_range(task)
-    return Source(
+    check_plain(folder)
+    for path in sorted(folder.rglob("*.hdf5")):
+        with opened(path):
+            pass
+    with refusing(f"{given} can't be read as a Minari data set"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        told = json.loads((folder / _METADATA).read_bytes())
+        if lacking := {"observation_space", "action_space"} - told.keys():
+            raise InputError(f"{folder / _METADATA} has no {min(lacking)}")  # Minari would run code
+        stored = MinariStorage.read(folder)
+        seen, actions = stored.observation_space, stored.action_space
+        name = f"Minari {told.get('dataset_id', given)}"
+        features = tuple(features_of(name, seen))
+        if not isinstance(actions, spaces.Box) or actions.dtype.kind != "f":
+            raise InputError(f"{name} has actions in {actions}: only continuous ones are possible")
+        numbers, episodes = range(stored.total_episodes), dict[str, dict[str, Array]]()
+        for number, episode in enumerate(stored.get_episodes(numbers)):
+            arrays = {role: np.asarray(episode[each]) for role, each in _NAMES.items()}
+            arrays["observation"] = _flat(seen, episode["observations"])  # a row more than others
+            arrays["action"] = _flat(actions, episode["actions"])
+            episodes[f"episode {number}"] = arrays
+        seeds = [each.get("seed") for each in stored.get_episode_metadata(numbers)]
+    task, why_not, label, limit = _task(told, label_of(name), (len(features), flatdim(actions)))
+    own = told.get(_OWN, {})
+    columns, place = joined(name, episodes)
+    about = About(features=task.features if task else features, offsets=(*own.get("offsets", ()),))
+    return frame_of_steps(
         name,
-        identity,
-        lambda: _episodes(name, storage),
-        task=task,
-        features=features,
+        columns,
+        {"seed": [UNKNOWN_SEED if seed is None else int(seed) for seed in seeds]},
+        about,
+        label=label,
+        place=place,
+        task=without_range(task) if task and own.get("own_rewards") else task,
+        why_no_task=why_not,
         action_bounds=(actions.low.ravel(), actions.high.ravel()),
         max_episode_steps=limit,
-        why_no_task=why_not,
-        subtracted=np.array(exported.offsets) if exported and exported.offsets else 0.0,
     )
-
-
-def _continuous(name: str, space: spaces.Space[Any]) -> spaces.Box:
-    if not isinstance(space, spaces.Box):
-        raise InputError(f"{name} has actions in {space}: only continuous ones are possible")
-    check_kind(name, "action", space.dtype, space.shape)
-    return space
 
 
 def _folder(given: str) -> Path:
@@ -127,80 +111,26 @@ def _folder(given: str) -> Path:
     )
 
 
-def _check_files(folder: Path) -> Checksums | None:
-    """Make sure that all files are inside the folder, and as jbrep exported them, if so.
-
-    Raises:
-        DamageError: one isn't what was exported.
-    """
-    known = read_document(folder / _CHECKSUMS, Checksums) if exists(folder / _CHECKSUMS) else None
-    if known:
-        for name, sha256 in known.files.items():
-            if _sha256(folder / name) != sha256:
-                raise DamageError(
-                    f"{folder / name} is damaged: it isn't what was exported, by its checksum; "
-                    "export the data set again"
-                )
-    for path in sorted(folder.rglob("*.hdf5")):
-        with opened(path, whole=True):
-            pass
-    return known
-
-
-def _sha256(path: Path) -> str:
-    """Of a file; empty where there is none."""
-    return hashlib.sha256(read_file(path)).hexdigest() if exists(path) else ""
-
-
-def _metadata(folder: Path) -> dict[str, Any]:
-    """What the data set says of itself."""
-    path = folder / _METADATA
-    raw = read_file(path)
-    with refusing(f"{path} can't be read", (ValueError, KeyError, TypeError, RecursionError)):
-        metadata = json.loads(raw)
-        spaces_of = [metadata["observation_space"], metadata["action_space"]]
-    if not all(isinstance(space, str) for space in spaces_of):
-        raise InputError(f"{path} doesn't say what observations and actions are")
-    return dict(metadata)
-
-
-def _storage(given: str, folder: Path) -> storages.MinariStorage:
+def _task(
+    told: dict[str, Any], label: str, sizes: tuple[int, int]
+) -> tuple[Task | None, str, str, int | None]:
+    """The task, if its environment can be made here, or why not; a label, and the time limit."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return storages.MinariStorage.read(folder)
-    except ModuleNotFoundError:
-        raise
-    except Exception as error:  # whatever Minari raises
-        raise _unreadable(given, error) from None
-
-
-def _unreadable(name: str, error: Exception) -> InputError:
-    return InputError(f"{name} can't be read as a Minari data set: {kind_and_line(error)}")
-
-
-def _environment(metadata: dict[str, Any]) -> tuple[str, dict[str, Any], int | None]:
-    """Id, arguments and time limit of the environment; an empty id if none is named."""
-    try:
-        spec = json.loads(metadata["env_spec"])
-        env_id, arguments, limit = spec["id"], spec["kwargs"], spec["max_episode_steps"]
-    except (KeyError, ValueError, TypeError, RecursionError):
-        return "", {}, None
-    if not isinstance(env_id, str) or not isinstance(arguments, dict):
-        return "", {}, None
-    return env_id, arguments, limit if type(limit) is int and limit > 0 else None
-
-
-def _describe(env_id: str, arguments: dict[str, Any], limit: int | None) -> tuple[Task | None, str]:
-    """The task, if its environment can be made here, or why not."""
-    if not env_id:
-        return None, "it names no environment"
+        spec = json.loads(told["env_spec"])
+        env_id, arguments, given = spec["id"], dict(spec["kwargs"]), spec["max_episode_steps"]
+        limit = int(given) if given else None
+    except (KeyError, ValueError, TypeError):
+        return None, Frame.why_no_task, label, None
     if not _is_harmless(arguments):
-        return None, f"the arguments of {env_id} may name files, so that it isn't made"
+        why_not = f"the arguments of {env_id} may name files, so that it isn't made"
+        return None, why_not, env_id, limit
     try:
-        return describe(env_id, arguments, limit), ""
+        task = describe(str(env_id), arguments, limit)
     except (InputError, ModuleNotFoundError) as error:
-        return None, kind_and_line(error)
+        return None, kind_and_line(error), env_id, limit
+    if (task.size, task.action_size) != sizes:
+        return None, f"{env_id} has other sizes", label, limit
+    return task, "", env_id, limit
 
 
 def _is_harmless(value: Any) -> bool:
@@ -212,100 +142,52 @@ def _is_harmless(value: Any) -> bool:
     return not isinstance(value, str) or bool(_WORD.fullmatch(value) and not exists(value))
 
 
-def _episodes(name: str, storage: storages.MinariStorage) -> Iterator[Incoming]:
-    for number, (episode, seed) in enumerate(_read(name, storage)):
-        where = f"{name}: episode {number}"
-        given = {
-            "action": _flat(where, storage.action_space, episode["actions"]),
-            "observation": _flat(where, storage.observation_space, episode["observations"]),
-            "reward": episode["rewards"],
-            "terminated": episode["terminations"],
-            "truncated": episode["truncations"],
-        }
-        yield from whole_episode(where, given, seed=seed)
-
-
-def _read(name: str, storage: storages.MinariStorage) -> Iterator[tuple[dict[str, Any], int]]:
-    """Each episode, and its seed."""
-    try:
-        numbers = range(storage.total_episodes)
-        pairs = zip(
-            storage.get_episodes(numbers), storage.get_episode_metadata(numbers), strict=True
-        )
-        for episode, metadata in pairs:
-            seed = metadata.get("seed")
-            yield episode, UNKNOWN_SEED if seed is None else int(seed)
-    except Exception as error:  # whatever Minari and HDF5 raise at damaged files
-        raise _unreadable(name, error) from None
-
-
-def _flat(where: str, space: spaces.Space[Any], values: Any) -> Array:
+def _flat(space: spaces.Space[Any], values: Any) -> Array:
     """Observations as Gymnasium flattens them, (n, ...) to (n, d)."""
-    try:
-        if isinstance(space, spaces.Dict):
-            parts = [_flat(where, part, values[key]) for key, part in space.spaces.items()]
-            return np.concatenate(parts, axis=1)
-        if isinstance(space, spaces.Tuple):
-            pairs = zip(space.spaces, values, strict=True)
-            return np.concatenate([_flat(where, *pair) for pair in pairs], axis=1)
-        array = np.asarray(values)
-        if isinstance(space, spaces.Box):
-            return array.reshape(len(array), int(np.prod(space.shape)))
-        flat = [flatten(space, value) for value in array]
-        return np.array(flat).reshape(len(array), spaces.utils.flatdim(space))
-    except (ValueError, KeyError, IndexError, TypeError) as error:
-        raise InputError(f"{where} doesn't fit {space}: {kind_and_line(error)}") from None
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts: Any = space.spaces
+        keys = parts if isinstance(parts, dict) else range(len(parts))
+        return np.concatenate([_flat(parts[key], values[key]) for key in keys], axis=1)
+    array = np.asarray(values)
+    if not isinstance(space, spaces.Box):
+        array = np.array([flatten(space, value) for value in array])
+    return array.reshape(len(array), flatdim(space))
 
 
 def write(dataset: Dataset, out: Path) -> str:
     """Add a data set to a folder of Minari data sets; returns how to open it."""
-    settings = dataset.manifest.settings
-    name = f"{_namespace(settings.task)}/{settings.policy['kind']}-v0"
-    path, spec = out / name, _env_spec(settings)
+    settings, task, versions = dataset.manifest.settings, dataset.task, dataset.manifest.versions
+    namespace = f"jitterbug/{task.slug}" if task.id.startswith("Jitterbug/") else task.name
+    namespace = re.sub(r"[^A-Za-z0-9_/-]+", "-", namespace)
+    namespace = namespace if len(namespace) > 1 else f"task-{namespace}"  # no single letter
+    name = f"{namespace}/{settings.policy['kind']}-v0"
     dataset["reward"]  # says what to do if there are none
+    own: dict[str, Any] = {"own_rewards": True} if settings.reward else {}
+    own |= {"offsets": task.offset.tolist()} if task.offset.any() else {}
+    about = {
+        "dataset_id": name,
+        "minari_version": minari.__version__,
+        "algorithm_name": settings.policy["kind"],
+        "description": f"{json.dumps(settings.as_json())} {dataset.fingerprint}",
+        "requirements": [f"{package}=={versions[package]}" for package in ("jbrep", "mujoco")],
+        _OWN: own,
+    }
+    bounds = np.array((task.action_low, task.action_high), np.float32)
+    seen = spaces.Box(-np.inf, np.inf, (task.size,), np.float32)
+    path, actions, spec = out / name, spaces.Box(*bounds, dtype=np.float32), _env_spec(settings)
     make_folder(path.parent)
-    with unfinished(path) as root:  # Minari ignores hidden folders
-        root.mkdir()
-        with _datasets_in(root.resolve()), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # on the missing author and address
-            _create(dataset, name, spec)
-        _write_checksums(root / name / "data", settings)
-        for namespace in Path(name).parents[:-1]:
-            metadata = namespace / NAMESPACE_METADATA_FILENAME
-            if not exists(out / metadata):
-                write_whole(out / metadata, (root / metadata).read_bytes())
-        publish(root / name, path)
+    episodes = len(dataset.episodes["length"]) * _EPISODE_BYTES
+    check_space(path.parent, len(dataset) * settings.row_bytes() + episodes)
+    with unfinished(path) as partial:  # Minari ignores hidden folders
+        partial.mkdir()
+        made = MinariStorage.new(partial / "data", seen, actions, spec)
+        made.update_metadata(about)
+        made.update_episodes(_buffers(dataset))
+        for parent in Path(name).parents[:-1]:
+            if not exists(metadata := out / parent / NAMESPACE_METADATA_FILENAME):
+                write_whole(metadata, b"{}")
+        publish(partial, path)
     return f"{_ROOT}={out} and minari.load_dataset({name!r})"
-
-
-def _write_checksums(folder: Path, settings: DataSettings) -> None:
-    files = {path.name: _sha256(path) for path in sorted(folder.iterdir())}
-    offsets = tuple(settings.task.offset.tolist()) if settings.task.offset.any() else ()
-    known = Checksums(files=files, offsets=offsets, own_rewards=True if settings.reward else UNSET)
-    known.write(folder / _CHECKSUMS)
-
-
-def _namespace(task: Task) -> str:
-    """Jitterbug's tasks stand together; another's name has no version there."""
-    name = f"jitterbug/{task.slug}" if task.id.startswith("Jitterbug/") else task.name
-    name = re.sub(r"[^A-Za-z0-9_/-]+", "-", name)
-    return name if len(name) > 1 else f"task-{name}"  # Minari takes no single letter
-
-
-def _create(dataset: Dataset, name: str, spec: EnvSpec | None) -> None:
-    settings, versions = dataset.manifest.settings, dataset.manifest.versions
-    task = settings.task
-    low, high = (np.array(ends, np.float32) for ends in (task.action_low, task.action_high))
-    minari.create_dataset_from_buffers(
-        name,
-        _buffers(dataset),
-        env=spec,
-        observation_space=spaces.Box(-np.inf, np.inf, (task.size,), np.float32),
-        action_space=spaces.Box(low, high, dtype=np.float32),
-        algorithm_name=settings.policy["kind"],
-        description=f"{json.dumps(settings.as_json())} {dataset.fingerprint}",
-        requirements=[f"{package}=={versions[package]}" for package in ("jbrep", "mujoco")],
-    )
 
 
 def _env_spec(settings: DataSettings) -> EnvSpec | None:
@@ -327,18 +209,6 @@ def _env_spec(settings: DataSettings) -> EnvSpec | None:
     spec.kwargs.update(task.arguments)
     spec.max_episode_steps = task.max_episode_steps
     return None if callable(spec.entry_point) else spec
-
-
-@contextmanager
-def _datasets_in(folder: Path) -> Iterator[None]:
-    before = os.environ.get(_ROOT)
-    os.environ[_ROOT] = str(folder)
-    try:
-        yield
-    finally:
-        del os.environ[_ROOT]
-        if before is not None:
-            os.environ[_ROOT] = before
 
 
 def _buffers(dataset: Dataset) -> Iterator[EpisodeBuffer]:

@@ -1,0 +1,171 @@
+"""Which columns of a frame are what to a data set: by a layout, or else by their names."""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import pyarrow as pa
+
+from jbrep.dataset.formats.frame import ALIASES, About, Frame, check_names, own_names, width
+from jbrep.dataset.layout import Layout
+from jbrep.envs.names import is_code
+from jbrep.envs.task import MAX_FEATURES, Feature
+from jbrep.errors import InputError, matching
+from jbrep.text import words
+
+WIDE = ("observation", "action", "next_observation")  # with many numbers a row
+DEGREES = ("deg", "°", "degrees", "degree")
+RADIANS = ("", "rad")
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}  # by unit
+_ACTION = re.compile(r"actions?(_\d+)?")
+_NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
+
+
+class Leaf(NamedTuple):
+    """A number of each row: a column, or a part of a column of lists."""
+
+    name: str
+    short: str  # the name for a feature, unless two are the same
+    column: str
+    place: int | None  # in a list
+    kind: pa.DataType
+    unit: str
+    subtracted: float  # already
+    feature: Feature | None
+    is_angle: bool = False
+
+
+Roles = Mapping[str, list[Leaf]]  # by the keys of ALIASES, and time
+
+
+def roles_of(frame: Frame, layout: Layout) -> Roles:
+    """Which columns are what."""
+    name, names = frame.name, frame.schema.names
+    if twice := [each for each, n in Counter(names).items() if n > 1]:
+        raise InputError(f"{name} has two columns {twice[0]!r}: rename one")
+    leaves = [leaf for each in frame.schema for leaf in _leaves(frame, each)]
+    for column, unit in layout.units.items():
+        meant = {*_matching(frame, leaves, (column,))}
+        leaves = [each._replace(unit=unit) if each in meant else each for each in leaves]
+    own = own_names(name, [*names, *frame.unusable])
+    said = {role: (column,) for role, column in own.items()} | _said(layout)
+    for role in ["step"] * bool(layout.time) + ["reward"] * is_code(layout.reward):
+        said.pop(role, None)  # times tell more than numbers of steps
+    roles = {role: _matching(frame, leaves, some) for role, some in said.items()}
+    roles.setdefault("action", [each for each in leaves if _ACTION.fullmatch(each.column)])
+    taken = {*own.values()} | {each.name for some in roles.values() for each in some}
+    others = [each for each in leaves if not {each.name, each.column} & taken]
+    others = [each for each in others if not _NOT_FEATURES.fullmatch(each.column)]
+    others = _matching(frame, leaves, frame.task.feature_names) if frame.task else others
+    seen = roles.setdefault("observation", others)
+    angles = {*_matching(frame, seen, layout.angles, "observation")}
+    roles["observation"] = [each._replace(is_angle=each in angles) for each in seen]
+    if layout.observations:
+        roles["next_observation"] = _after(frame, leaves, seen)
+    roles = {role: some for role, some in roles.items() if some}
+    check_names(name, [*roles, *(["step"] if layout.time or layout.length else [])], names)
+    for role, some in roles.items():
+        if len(some) > (MAX_FEATURES if role in WIDE else 1):
+            raise InputError(f"{name} has {len(some)} numbers of the {role} in a row: too many")
+    for each in [] if layout.actions else roles["action"]:
+        if not pa.types.is_floating(each.kind):
+            has = f"{name} has {each.kind} in the column {each.column!r}"
+            raise InputError(f"{has}: actions must be continuous; if it is, name the actions")
+    return roles
+
+
+def _leaves(frame: Frame, column: pa.Field) -> Iterator[Leaf]:
+    size, kind, about = width(column.type), column.type, frame.about.get(column.name, About())
+    places: list[int | None] = [None] if size is None else [*range(size)]
+    for what, said in about._asdict().items():
+        if said and len(said) != len(places):
+            has = f"{frame.name} has {what} of {len(said)} numbers of {column.name!r}"
+            raise InputError(f"{has}: they must be of {len(places)}")
+    for i, place in enumerate(places):
+        feature = about.features[i] if about.features else None
+        own = about.names[i] if about.names else feature.name if feature else ""
+        yield Leaf(
+            column.name if place is None else f"{column.name}.{own or place}",
+            own or (column.name if place is None else f"{column.name}_{place}"),
+            column.name,
+            place,
+            kind if place is None else kind.value_type,
+            about.units[i] if about.units else feature.unit if feature else "",
+            about.offsets[i] if about.offsets else 0.0,
+            feature,
+        )
+
+
+def _said(layout: Layout) -> dict[str, tuple[str, ...]]:
+    """The names of columns that a layout says, by what they are."""
+    once = {role: getattr(layout, role) for role in ("time", "episode", "terminated", "reward")}
+    said = {role: (name,) for role, name in once.items() if name}
+    wide = {"action": layout.actions, "observation": layout.observations}
+    return said | {role: names for role, names in wide.items() if names}
+
+
+def _matching(
+    frame: Frame, leaves: list[Leaf], names: tuple[str, ...], what: str = "column"
+) -> list[Leaf]:
+    """Those of such names or patterns, in the order of the names and each once."""
+    for name in names:
+        if name in frame.unusable:
+            raise InputError(f"{frame.name}: {name} can't be used: it is {frame.unusable[name]}")
+    own, columns = [each.name for each in leaves], [each.column for each in leaves]
+    return [leaves[i] for i in matching(names, own, columns, f"{frame.name} has no {what}")]
+
+
+def _after(frame: Frame, leaves: list[Leaf], seen: list[Leaf]) -> list[Leaf]:
+    """The columns of the same after the action; none if one is missing."""
+    after = {**{name: f"next_{name}" for name in ALIASES["observation"]}, **frame.after}
+    places = {(each.column, each.place): each for each in leaves}
+    found = [places.get((after.get(each.column, ""), each.place)) for each in seen]
+    return [each for each in found if each] if all(found) else []
+
+
+def is_of_task(frame: Frame, roles: Roles) -> bool:
+    """Whether observations and actions are those of the frame's task, in its order.
+
+    Those that are said to be angles, or in other units, are others.
+    """
+    if not frame.task or any(each.is_angle for each in roles["observation"]):
+        return False
+    seen = [(each.short, each.unit) for each in roles["observation"]]
+    names = frame.schema.names
+    actions = [(names.index(each.column), each.place or 0) for each in roles["action"]]
+    known = [(each.name, each.unit) for each in frame.task.features]
+    return seen == known and actions == sorted(actions)
+
+
+def features_of(name: str, leaves: list[Leaf]) -> tuple[Feature, ...]:
+    """The features by the names and units of their columns; name is the frame's."""
+    shorts, features, pi = Counter(each.short for each in leaves), list[Feature](), math.pi
+    names = words(each.short if shorts[each.short] == 1 else each.name for each in leaves)
+    for each, word in zip(leaves, names, strict=True):
+        if not each.is_angle:
+            known = each.feature or Feature(name=word)
+            features.append(known.replace(name=word, unit=each.unit[:40]))
+        elif each.unit in (*RADIANS, *DEGREES):
+            angle = Feature(name=word, unit="rad", low=-pi, high=pi, bounded=True, kind="angle")
+            features.append(angle)
+        else:
+            raise InputError(
+                f"{name} has the angle {each.name!r} in {each.unit!r}: give rad or deg"
+            )
+    return tuple(features)
+
+
+def second_of(name: str, time: Leaf) -> float:
+    """What brings times to seconds; name is the frame's."""
+    is_stamp = pa.types.is_timestamp(time.kind) or pa.types.is_duration(time.kind)
+    is_number = pa.types.is_integer(time.kind) or pa.types.is_floating(time.kind)
+    if not (is_stamp or is_number or pa.types.is_decimal(time.kind)):
+        has = f"{name} has {time.kind} in the column {time.column!r}"
+        raise InputError(f"{has}: times must be numbers, timestamps or durations")
+    unit = "ns" if is_stamp else time.unit or "s"
+    if unit not in SECONDS:
+        has = f"{name} has times {time.name!r} in {unit!r}"
+        raise InputError(f"{has}: choose one of {', '.join(SECONDS)}")
+    return SECONDS[unit]
