@@ -306,7 +306,7 @@ def train(
     from jbrep.envs.description import as_task
     from jbrep.envs.make import is_one_robot
     from jbrep.machine import cores
-    from jbrep.rl.bar import Bar
+    from jbrep.rl.history import Bar
     from jbrep.rl.run import Run
     from jbrep.rl.settings import MODERN
     from jbrep.rl.training import Session, standing_of
@@ -326,7 +326,7 @@ def train(
         _note_limits(now.settings)
     writers = []
     if wandb:
-        from jbrep.rl.tracker import Tracker
+        from jbrep.rl.history import Tracker
 
         writers.append(Tracker(wandb, folder, now.settings))
     with closing(Bar(run.steps, f"{algorithm} on {found.name}")) as bar:
@@ -338,7 +338,7 @@ def train(
             threads=threads or cores(),
             retries=retries,
         )
-        record = train_run(run, folder, session)
+        record = train_run(run, folder, session, found)
     return Agent(folder, record, None if isinstance(encoder, str | Path) else encoder)
 
 

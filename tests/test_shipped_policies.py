@@ -9,7 +9,7 @@ from command import jbrep, mistake
 from jbrep.dataset import Dataset
 from jbrep.envs import describe
 from jbrep.play.sources import find_episode, find_player
-from jbrep.rl.shipped import FOLDER, SHIPPED, file_of, shipped
+from jbrep.rl.policy_file import FOLDER, SHIPPED, shipped, shipped_file
 
 SHIPS = shipped()
 
@@ -41,7 +41,9 @@ def test_it_collects_and_is_kept_with_the_data(tmp_path):
     assert told.exit_code == 0, told.output
     (_, _), (_, kept) = Dataset(tmp_path / "data").manifest.settings.policy["parts"]
     assert kept["run"] == SHIPPED
-    assert (tmp_path / "data" / kept["file"]).read_bytes() == file_of("face_direction").read_bytes()
+    assert (tmp_path / "data" / kept["file"]).read_bytes() == shipped_file(
+        "face_direction"
+    ).read_bytes()
     assert jbrep("data", "verify", tmp_path / "data", "--replay", 3).exit_code == 0
 
 

@@ -291,8 +291,7 @@ def import_model(
     graph; onnxruntime runs it.
     """
     from jbrep.encoders.card import card
-    from jbrep.encoders.encoder import Encoder
-    from jbrep.encoders.file import SUFFIX, save_new
+    from jbrep.encoders.encoder import SUFFIX, Encoder, save_new
     from jbrep.records.storage import exists, taken
 
     task = needed_task(options)

@@ -1,4 +1,4 @@
-"""Looking at episodes, encoders and studies in the Rerun viewer."""
+"""Looking at episodes and encoders in the Rerun viewer."""
 
 import os
 import socket
@@ -51,12 +51,12 @@ def inspect(
     serve: bool,
     **options: Any,
 ) -> None:
-    """Record an episode, encoder or study to see in Rerun.
+    """Record an episode or encoder to see in Rerun.
 
-    SOURCE is a data set, a run, a folder with several runs, an encoder's file, or a policy such as
-    uniform, which needs a --task, as does an encoder by its name. An unfinished run plays its last
-    checkpoint. The robot is shown where MuJoCo simulates it; with an encoder, what is decoded is
-    shown beside what was observed, and for the Jitterbug the decoded robot beside the true one.
+    SOURCE is a data set, a run, an encoder's file, or a policy such as uniform, which needs a
+    --task, as does an encoder by its name. An unfinished run plays its last checkpoint. The robot
+    is shown where MuJoCo simulates it; with an encoder, what is decoded is shown beside what was
+    observed, and for the Jitterbug the decoded robot beside the true one.
     """
     if view and serve:
         raise InputError("--view and --serve exclude each other: choose one")

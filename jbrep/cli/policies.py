@@ -255,7 +255,7 @@ class _Zip(NamedTuple):
     def player(self, path: Path, task: "Task | None", encoder: str | None) -> "Player":
         """The policy in it; what it doesn't tell is noted."""
         from jbrep.play.sources import as_player
-        from jbrep.rl.from_zip import load_zip  # imports torch
+        from jbrep.rl.policy_zip import load_zip  # imports torch
 
         algorithm = self.algorithm or "sac"
         found = load_zip(path, task, algorithm, encoder, self.trust, self.vecnormalize)
@@ -306,7 +306,7 @@ def policies(as_json: bool) -> None:
     Every command that takes a policy knows the one for its --task as trained, as in jbrep render
     trained --task face_direction --out walk.mp4.
     """
-    from jbrep.rl.shipped import SHIPPED, shipped
+    from jbrep.rl.policy_file import SHIPPED, shipped
 
     ships = shipped()
     if as_json:

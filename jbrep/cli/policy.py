@@ -46,10 +46,9 @@ def export(policy: str, task: str | None, form: str, out: Path) -> None:
     from jbrep.envs.description import describe
     from jbrep.envs.names import modules_of
     from jbrep.play.sources import policy_file
-    from jbrep.rl.controller import load_policy
-    from jbrep.rl.export import described
-    from jbrep.rl.export import export as write
-    from jbrep.rl.shipped import SHIPPED
+    from jbrep.rl.controller import described, load_policy
+    from jbrep.rl.controller import export as write
+    from jbrep.rl.policy_file import SHIPPED
 
     if task and policy != SHIPPED:
         raise InputError(

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jbrep.evaluate import control, prediction, readout, reconstruction
-from jbrep.evaluate.evaluation import Diagnostics
-from jbrep.evaluate.registry import SCALARS, Scalar
+from jbrep.evaluate.evaluation import SCALARS, Diagnostics, Scalar
 from jbrep.records.tables import Columns, csv_text, finite, read_csv
 
 # what is imported from here registers itself in SCALARS
@@ -46,9 +45,6 @@ def read_diagnostics(path: Path, sha256: str | None = None) -> list[Diagnosed]:
     Args:
         path: of its file.
         sha256: of the file, if it is known.
-
-    Raises:
-        DamageError: it is not such a table, or has another SHA-256.
     """
     return [Diagnosed(*row) for row in read_csv(path, _KEY, sha256, further=_value)]
 
