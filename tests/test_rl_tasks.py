@@ -208,7 +208,6 @@ def test_an_environment_that_is_not_reproducible(tmp_path):
 @pytest.mark.parametrize(
     ("algorithm", "overrides"),
     [
-        ("sac", {"learning_starts": 50}),
         ("tqc", {"learning_starts": 50, "use_sde": True}),
         ("a2c", {"num_envs": 1}),  # one robot, whose episodes last 40 steps
     ],

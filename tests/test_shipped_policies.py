@@ -31,8 +31,8 @@ def test_each_file_that_ships_is_listed_with_what_it_returns():
 def test_it_returns_what_the_table_says(policy):
     """Rounding parts long episodes, so that single returns differ between processors."""
     known = policy.returns[SHIPPED]
-    played = find_player(SHIPPED, describe(policy.task)).returns(8)
-    assert abs(played.mean() - known[:8].mean()) < 2 * known.std() + 20
+    played = find_player(SHIPPED, describe(policy.task)).returns(2)
+    assert abs(played.mean() - known[:2].mean()) < 2 * known.std() + 20
 
 
 def test_it_collects_and_is_kept_with_the_data(tmp_path):
