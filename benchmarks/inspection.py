@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from timing import timed
 
 from jbrep.encoders import find
-from jbrep.inspection.episode import record_episode, record_traversal
+from jbrep.inspection.subject import record_episode, record_traversal
 from jbrep.play.sources import find_episode
 
 ROUNDS = 5

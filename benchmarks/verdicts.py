@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.progress import Progress
-from jbrep.stats import claims, spread
+from jbrep.stats import claims
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.claims import BETTER, CLAIMS, CONTRADICTED, SUPPORTED
 from jbrep.stats.rules import Planned, Rules
@@ -28,9 +28,9 @@ from jbrep.text import table
 # verdicts come from p-values and the side of the boundary; intervals would take most of the time
 _claims: Any = claims
 _claims.ratio_of_spreads = lambda curves, *how: Interval(
-    np.exp(spread._excess(curves, 0.0)), np.nan, np.nan
+    np.exp(claims._excess(curves, 0.0)), np.nan, np.nan
 )
-_claims.spread_p = partial(spread.spread_p, permutations=999)  # in place of ten times as many
+_claims.spread_p = partial(claims.spread_p, permutations=999)  # in place of ten times as many
 
 Array = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, Array], Array]  # final returns, from what seeds share

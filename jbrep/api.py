@@ -329,8 +329,8 @@ def train(
 
     known = check_learner(task, algorithm, preset, encoder, begin_from)
     from jbrep.machine import cores
-    from jbrep.rl.bar import Bar
-    from jbrep.rl.run import Run  # imports torch
+    from jbrep.rl.history import Bar
+    from jbrep.rl.run import Run
     from jbrep.rl.training import Session, standing_of
     from jbrep.rl.training import train as train_run
 
@@ -349,7 +349,7 @@ def train(
         _note_limits(now.settings)
     writers = []
     if wandb:
-        from jbrep.rl.tracker import Tracker
+        from jbrep.rl.history import Tracker
 
         writers.append(Tracker(wandb, folder, now.settings))
     with closing(Bar(run.steps, f"{algorithm} on {found.name}")) as bar:
@@ -361,7 +361,7 @@ def train(
             threads=threads or cores(),
             retries=retries,
         )
-        record = train_run(run, folder, session)
+        record = train_run(run, folder, session, found)
     return Agent(folder, record, None if isinstance(encoder, str | Path) else encoder)
 
 

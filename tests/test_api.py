@@ -10,7 +10,7 @@ from click.testing import CliRunner
 import jbrep
 from jbrep.cli import main
 from jbrep.errors import InputError, Notice
-from jbrep.rl.shipped import find
+from jbrep.rl.policy_file import find_shipped as find
 
 QUICK = {"steps": 64, "evaluate_every": 64, "evaluation_episodes": 1, "final_episodes": 3}
 

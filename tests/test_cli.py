@@ -311,7 +311,7 @@ def test_steps_that_are_no_number_are_refused(text, tmp_path):
 @pytest.mark.parametrize(
     ("package", "extra", "users", "command"),
     [
-        ("torch", "learn", ("jbrep.dae", "jbrep.methods.fit"), "train-dae --latent 8 --data {}"),
+        ("torch", "learn", ("jbrep.methods.fit",), "train-dae --latent 8 --data {}"),
         ("minari", "export", "jbrep.dataset.formats.minari", "data export {} --to minari"),
     ],
 )

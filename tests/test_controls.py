@@ -2,15 +2,11 @@
 
 import numpy as np
 import pytest
-import torch
 from sklearn.decomposition import PCA
-from torch import nn
 
-from jbrep.dae.autoencoder import Gradient
-from jbrep.dataset.scaled import Moments
 from jbrep.encoders.layers import run
 from jbrep.methods.controls import Random
-from jbrep.methods.linear import dense, linear_code, principal_code
+from jbrep.methods.linear import linear_code, principal_code
 
 
 def projection(data, latent, seed):
@@ -27,16 +23,6 @@ def error(parts, rows, noise=0.0, seed=0):
     drawn = noise * np.random.default_rng(seed).normal(size=rows.shape)
     encoder, decoder = parts
     return np.mean((run(decoder, run(encoder, (rows + drawn).astype(np.float32))) - rows) ** 2)
-
-
-def expected_error(parts, moments, noise):
-    """The same in expectation over rows and noise, for a linear code."""
-    (encoder,), (decoder,) = parts
-    both = decoder.weight.astype(float) @ encoder.weight.astype(float)
-    lost = both - np.eye(len(both))
-    shift = lost @ moments.mean + decoder.weight @ encoder.bias + decoder.bias
-    spread = np.trace(lost @ moments.covariance @ lost.T) + noise**2 * np.square(both).sum()
-    return (spread + shift @ shift) / len(both)
 
 
 def test_moments_are_those_of_the_training_rows(data, rows):
@@ -72,53 +58,3 @@ def test_a_random_projection_is_orthonormal_and_its_decoder_the_best(data, rows)
     same, other = (projection(data, 5, seed)[0][0].weight for seed in (1, 2))
     np.testing.assert_array_equal(encoder.weight, same)
     assert not np.array_equal(encoder.weight, other)
-
-
-def train_linear(rows, latent, noise, steps):
-    """A linear autoencoder, trained on the whole at each step."""
-    torch.manual_seed(0)
-    stack = nn.Sequential(nn.Linear(rows.shape[1], latent), nn.Linear(latent, rows.shape[1]))
-    optimiser = torch.optim.Adam(stack.parameters(), 3e-3)
-    gradient = Gradient(stack, len(rows))
-    clean = torch.from_numpy(rows.T.copy())
-    for _ in range(steps):
-        gradient(clean + noise * torch.randn(clean.shape), clean)
-        optimiser.step()
-    return stack
-
-
-def linear_denoiser(latent, noise, moments):
-    """The linear code of that size with the least error in restoring clean rows from corrupted.
-
-    Corruption adds noise of standard deviation `noise` to each feature. The best denoiser of full
-    rank is ridge regression, B = C (C + noise^2 I)^-1; of rank l, it is B projected on the first l
-    principal directions of its output B C (reduced-rank regression, Izenman 1975).
-    """
-    mean, covariance = moments
-    corrupted = covariance + noise**2 * np.eye(len(mean))
-    ridge = covariance @ np.linalg.pinv(corrupted, hermitian=True)
-    _, vectors = np.linalg.eigh(ridge @ covariance)
-    directions = vectors[:, ::-1][:, :latent]
-    weight = directions.T @ ridge
-    return (dense(weight, -weight @ mean),), (dense(directions, mean),)
-
-
-def test_the_denoiser_bounds_a_linear_dae_that_comes_near_it():
-    generator = np.random.default_rng(0)
-    rows = (generator.normal(size=(4000, 3)) @ generator.normal(size=(3, 6)) / 3).astype(np.float32)
-    moments = Moments(rows.mean(axis=0, dtype=float), np.cov(rows.T.astype(float), bias=True))
-    bound = expected_error(linear_denoiser(2, 0.3, moments), moments, 0.3)
-    parts = [
-        (type("L", (), {"weight": m.weight.detach().numpy(), "bias": m.bias.detach().numpy()}),)
-        for m in train_linear(rows, 2, 0.3, 1500)
-    ]
-    trained = expected_error(parts, moments, 0.3)
-    assert bound < trained < 1.02 * bound
-
-
-def test_a_wide_linear_autoencoder_reconstructs():
-    rows = np.random.default_rng(0).normal(size=(500, 5)).astype(np.float32)
-    stack = train_linear(rows, 8, 0, 2500)
-    with torch.no_grad():
-        lost = (stack(torch.from_numpy(rows)) - torch.from_numpy(rows)).square().mean().item()
-    assert lost < 1e-4

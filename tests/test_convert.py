@@ -14,18 +14,17 @@ from small import ONE_EACH
 from torch import nn
 from torch.nn import functional
 
-from jbrep.dae import DAE
 from jbrep.encoders import ACTIVATIONS, Encoder, Layer, find, load, save
 from jbrep.encoders.card import card
 from jbrep.encoders.layers import activate
 from jbrep.encoders.onnx import export
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.evaluate import diagnose
+from jbrep.methods.autoencoder import DAE
 from jbrep.methods.registry import name_of, read_name
 from jbrep.rl import Run, train
+from jbrep.rl.controller import export as export_policy
 from jbrep.rl.controller import load_policy
-from jbrep.rl.export import export as export_policy
 from jbrep.rl.files import ENCODER
 from jbrep.rl.policy import load_run
 from jbrep.training.network import get_architecture
@@ -153,13 +152,6 @@ def test_its_file_gives_the_same_encoder_back_also_in_another_process(encoder, t
     assert "16 -> 10 onnx" in card(again, "it", 80)
 
 
-def test_it_is_evaluated_like_any_other(encoder):
-    evaluation = diagnose({"mine": encoder}, "data/sample/face_direction")
-    judged = evaluation.encoders["mine"]
-    assert (judged.kind, judged.latent) == ("imported", 10)
-    assert judged.reconstruction.mse.value > 0
-
-
 @pytest.fixture(scope="module")
 def run(encoder, tmp_path_factory):
     """A short run on it."""
@@ -194,12 +186,9 @@ class Wrong(nn.Module):
     ("forward", "message"),
     [
         (lambda m, x: x if x.sum() > 0 else m.first(x), "Wrong can't be exported: "),
-        (lambda m, x: x @ torch.zeros(12, 3), "Wrong can't be exported: "),
         (lambda m, x: (m.first(x), x), "Wrong has the outputs "),
-        (lambda m, x: m.first(x).sum(1), r"Wrong made float32 of shape \(2,\)"),
-        (lambda m, x: m.first(x) / 0, "own failed: .* not finite"),
-        (lambda m, x: x - x.mean(0), "own returned other latents"),
-        (lambda m, x: torch.randn_like(x), "own returned other latents"),
+        (lambda m, x: m.first(x) / 0, "not finite"),
+        (lambda m, x: torch.randn_like(x), "other latents"),
     ],
 )
 def test_a_module_that_is_no_encoder_is_refused(forward, message):
@@ -315,25 +304,14 @@ def test_a_model_gives_what_onnxruntime_gives(name, tmp_path):
     np.testing.assert_allclose(played(tmp_path / "again.onnx")["latent"], encoder(ROWS), 1e-6)
 
 
-def test_a_decoder_of_its_own(tmp_path):
-    onnx.save(model("y = MatMul x w", {"w": f32(16, 3)}), tmp_path / "into.onnx")
-    back = model("y = MatMul x w", {"w": f32(3, 16)}, ("x", (1, 3)))
-    onnx.save(back, tmp_path / "back.onnx")
-    encoder = Encoder.from_onnx(tmp_path / "into.onnx", TASK, tmp_path / "back.onnx", "mine")
-    assert encoder.decode(encoder(ROWS)).shape == ROWS.shape
-
-
 @pytest.mark.parametrize(
     ("made", "message"),
     [
         (model("y = mine:Relu x"), "can't be run on several rows"),
-        (model("y = MatMul x w", {"w": f32(12, 3)}), "can't be run on several rows"),
-        (model("y = Reshape x n", {"n": np.array([1, -1])}, ("x", (1, 16))), "mine failed: "),
-        (model("y = Log x"), "mine failed: .* not finite"),
-        (model("y = Relu x", {}, ("x", ("rows", 12))), r"is \(rows, 12\), expected"),
-        (model("y = Relu x", {}, ("x", (16,))), r"is \(16\), expected"),
-        (model("y = Relu x; z = Tanh x", outputs="y z"), "has the outputs y, z"),
-        (model("y = Relu nothing"), "isn't an ONNX model that can be read"),
+        (model("y = Log x"), "not finite"),
+        (model("y = Relu x", {}, ("x", ("rows", 12))), "expected floats"),
+        (model("y = Relu x; z = Tanh x", outputs="y z"), "outputs y, z"),
+        (model("y = Relu nothing"), "isn't an ONNX model"),
     ],
 )
 def test_a_model_that_is_no_encoder_is_refused(made, message, tmp_path):
@@ -341,15 +319,6 @@ def test_a_model_that_is_no_encoder_is_refused(made, message, tmp_path):
     with pytest.raises(InputError, match=message) as refused:
         Encoder.from_onnx(tmp_path / "it.onnx", TASK, None, "mine")
     assert "\n" not in str(refused.value)
-
-
-def test_what_is_no_model_is_refused(tmp_path):
-    path = tmp_path / "it.onnx"
-    with pytest.raises(InputError, match="no file"):
-        Encoder.from_onnx(path, TASK, None, "mine")
-    path.write_text("PK hello")
-    with pytest.raises(InputError, match="isn't an ONNX model that can be read"):
-        Encoder.from_onnx(path, TASK, None, "mine")
 
 
 def elsewhere(location, weights):
@@ -391,7 +360,7 @@ def test_an_encoders_file_reads_no_other_file(tmp_path, monkeypatch):
         load(tmp_path / "forged")
 
 
-def test_sizes_of_ones_own_are_an_architecture(tmp_path):
+def test_sizes_of_ones_own_are_an_architecture():
     sizes = get_architecture("64,32")
     assert sizes == get_architecture("64x32")
     assert (sizes.name, sizes.hidden, sizes.output) == ("64x32", (64, 32), "linear")
@@ -400,11 +369,6 @@ def test_sizes_of_ones_own_are_an_architecture(tmp_path):
     assert (used.architecture, used.epochs) == ("64x32", deep.epochs)
     assert name_of(used) == "dae-64x32-8"
     assert read_name("dae-64x32-8").given == {"latent": 8, "architecture": "64x32"}
-    data = ("--data", "data/sample/face_direction", "--out", tmp_path)
-    command = ("train-encoder", "--kind", "untrained", "--latent", "8", *data, "--architecture")
-    jbrep(*command, "64,32")
-    made = load(tmp_path / "untrained-64x32-8.safetensors")
-    assert [len(layer.bias) for layer in (*made.encoder, *made.decoder)] == [64, 32, 8, 32, 64, 16]
-    assert made.header.training["architecture"] == "64x32"
     for wrong in ("64,,32", "0", "64,5000"):
-        assert "architecture" in mistake(*command, wrong)
+        with pytest.raises(InputError, match="architecture"):
+            DAE.of({"latent": 8, "architecture": wrong})

@@ -6,9 +6,8 @@ import pytest
 from wide import wide
 
 from jbrep.errors import DamageError, InputError
-from jbrep.evaluate import diagnose, registry
-from jbrep.evaluate.evaluation import Score
-from jbrep.evaluate.registry import Scalar, diagnostic
+from jbrep.evaluate import diagnose
+from jbrep.evaluate.evaluation import _REGISTERED, Scalar, Score, diagnostic
 from jbrep.evaluate.table import (
     SCALARS,
     Diagnosed,
@@ -29,7 +28,7 @@ KEY = "task,representation,sha256"
 
 def test_a_registered_function_is_measured_shown_and_tabled(monkeypatch, tmp_path):
     """Nothing else is to be changed for a further diagnostic."""
-    monkeypatch.setattr(registry, "_REGISTERED", [*registry._REGISTERED])
+    monkeypatch.setattr("jbrep.evaluate.evaluation._REGISTERED", [*_REGISTERED])
 
     @diagnostic(Scalar("farthest", "the largest mean of a unit", better=-1))
     def farthest(e):

@@ -15,7 +15,7 @@ from jbrep.coordinates import make_coordinates
 from jbrep.dataset.layout import Layout
 from jbrep.encoders.header import EncoderHeader
 from jbrep.envs import describe
-from jbrep.evaluate import registry
+from jbrep.evaluate import evaluation
 from jbrep.rl.settings import TrainingSettings
 from jbrep.stats.rules import Rules
 from jbrep.study.config import Data, Study, as_study
@@ -53,10 +53,10 @@ def test_the_python_runs(block, monkeypatch, tmp_path):
 @pytest.fixture(autouse=True)
 def registered_again(monkeypatch):
     """What a block registers, another may register, too."""
-    monkeypatch.setattr(registry, "_REGISTERED", [*registry._REGISTERED])
+    monkeypatch.setattr(evaluation, "_REGISTERED", [*evaluation._REGISTERED])
     yield
     gymnasium.registry.pop("Cart-v0", None)
-    registry.SCALARS.pop("farthest", None)
+    evaluation.SCALARS.pop("farthest", None)
 
 
 TOML = found(r"^```toml\n(.*?)^```")

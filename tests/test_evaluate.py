@@ -1,6 +1,5 @@
 """Diagnostics: against closed forms, other libraries, and sums by hand."""
 
-import json
 import tracemalloc
 from pathlib import Path
 
@@ -19,13 +18,12 @@ from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.encoders.header import EncoderHeader
 from jbrep.encoders.shipped import unlearned
 from jbrep.errors import InputError
-from jbrep.evaluate import diagnose, diagnosis
+from jbrep.evaluate import diagnose
 from jbrep.evaluate.diagnosis import seen, write
-from jbrep.evaluate.evaluation import EVALUATION, Evaluation
+from jbrep.evaluate.evaluation import EVALUATION, Evaluation, Judged
 from jbrep.evaluate.held_out import MAX_NUMBERS, HeldOut, sample_rows
 from jbrep.evaluate.readout import dynamics, latent_units, probes, quantities
 from jbrep.evaluate.reconstruction import reconstruction
-from jbrep.evaluate.registry import Judged
 from jbrep.evaluate.regression import ridge
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.controls import Random
@@ -33,8 +31,7 @@ from jbrep.methods.linear import principal_code
 from jbrep.records.document import read_document
 from jbrep.report import figures
 from jbrep.report.evaluation import evaluation_text
-from jbrep.report.figures import encoder_plots
-from jbrep.stats.bootstrap import bootstrap, by_episode
+from jbrep.stats.bootstrap import bootstrap
 
 
 @pytest.fixture(scope="module")
@@ -81,19 +78,6 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
         assert result.value == pytest.approx(episodes.mean())
         covered += result.low <= 3 <= result.high
     assert 0.9 <= covered / 300 <= 0.98
-
-
-def test_one_episode_has_no_interval():
-    result = bootstrap(lambda s: s[..., 0], np.ones((1, 1)))
-    assert result.value == 1
-    assert np.isnan([result.low, result.high]).all()
-    assert result.tolist() == [1.0, None, None]
-
-
-def test_sums_by_episode():
-    values = np.arange(10.0).reshape(5, 2)
-    expected = [[2, 4], [0, 0], [18, 21]]
-    np.testing.assert_array_equal(by_episode(values, np.array([0, 0, 2, 2, 2]), 3), expected)
 
 
 def test_held_out_rows_know_their_episodes(held_out):
@@ -189,25 +173,6 @@ def test_dead_units_are_found(held_out):
     assert 1 < result.participation_ratio < 2
 
 
-def test_the_participation_ratio_counts_equal_variances(held_out):
-    data = held_out.data
-    values, vectors = np.linalg.eigh(data.moments.covariance)
-    weight = (vectors[:, -5:] / np.sqrt(values[-5:])).T.astype(np.float32)
-    whitened = (Layer(weight, np.zeros(5, np.float32), "linear"),)
-    back = (Layer(weight.T.copy(), np.zeros(16, np.float32), "linear"),)
-    result = latent_units(make(data, (whitened, back)), HeldOut(train_as_test(data)))
-    assert result.participation_ratio == pytest.approx(5, rel=1e-3)
-    np.testing.assert_allclose(result.variance, 1, rtol=1e-3)
-
-
-def train_as_test(data):
-    """The same with its training rows held out, too."""
-    other = ScaledDataset(data.dataset)
-    other.train = other.test = data.train
-    other.scaler = data.scaler
-    return other
-
-
 def test_quantities_are_those_of_the_simulated_body():
     task = TASKS["move_to_pose"].describe()
     random = np.random.default_rng(0)
@@ -255,15 +220,6 @@ def test_a_wide_robot_can_be_judged(tmp_path):
         assert set(result.probes["obs_0"]) == {None}  # it is constant
     shown = evaluation_text(evaluation, 100, everything=True)
     assert max(map(len, shown.splitlines())) <= 100
-
-
-def test_episodes_of_one_row_have_no_dynamics(tmp_path):
-    data = wide([1] * 20, features=6)
-    result = write({"r-2": make(data, projection(data, 2, 0))}, data, tmp_path)
-    for judged in result.encoders.values():
-        assert {judged.scores[name] for name in ("next", "change")} == {(None, None, None)}
-        assert judged.reconstruction.mse[0] is not None
-    assert " nan" not in evaluation_text(result)
 
 
 def test_probes_are_ridge_regressions(held_out, coder):
@@ -322,16 +278,8 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     assert change[0] == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    "mixed",
-    [
-        np.random.default_rng(0).normal(size=(4, 4)) * [[9], [1], [1], [0.1]],
-        np.diag([1e-4, 1, 1, 10]),
-        1e-7 * np.eye(4),
-    ],
-    ids=["mixed", "scaled", "tiny"],
-)
-def test_units_mixed_or_scaled_do_not_change_how_well_the_next_is_read(held_out, coder, mixed):
+def test_units_mixed_or_scaled_do_not_change_how_well_the_next_is_read(held_out, coder):
+    mixed = np.random.default_rng(0).normal(size=(4, 4)) * [[9], [1], [1], [0.1]]
     (layer,) = coder.encoder
     weight, bias = ((mixed @ each).astype(np.float32) for each in (layer.weight, layer.bias))
     turned = (layer._replace(weight=weight, bias=bias),)
@@ -339,46 +287,6 @@ def test_units_mixed_or_scaled_do_not_change_how_well_the_next_is_read(held_out,
     both = (dynamics(judged(each, held_out)) for each in (coder, other))
     for one, two in zip(*both, strict=True):
         assert one == pytest.approx(two, abs=1e-3)
-
-
-def still(units, weight=0.0):
-    """Layers whose latent hardly depends on what is observed."""
-    bias = np.linspace(-0.3, 0.3, units, dtype=np.float32)
-    matrix = np.zeros((units, 16), np.float32)
-    matrix[0, 13] = weight
-    return (Layer(matrix, bias, "tanh"),), (
-        Layer(matrix.T.copy(), np.zeros(16, np.float32), "linear"),
-    )
-
-
-@pytest.mark.parametrize("parts", [still(3), still(3, 1.0), still(1), still(1, 1.0)])
-def test_dead_and_single_units_can_be_judged(held_out, parts, tmp_path):
-    result = write({"it": make(held_out.data, parts)}, held_out.data, tmp_path).encoders["it"]
-    units = len(result.latent_units.variance)
-    assert len(result.latent_units.dead) in (units, units - 1)
-
-
-def test_the_observation_alone_can_be_judged(held_out, everything, tmp_path):
-    evaluation = write({"identity": everything}, held_out.data, tmp_path)
-    assert [plot.name for plot in encoder_plots(evaluation)] == [
-        *("prediction_by_feature", "prediction_by_horizon", "error_by_feature"),
-    ]
-
-
-def test_a_constant_feature_can_be_judged(data):
-    flat = ScaledDataset(data.dataset)
-    flat.observations = lambda rows: iter([still_height(data, rows)])
-    is_height, bounds = np.arange(16) == 2, (data.scaler.low, data.scaler.high)
-    flat.scaler = Scaler(*(np.where(is_height, np.float32(0.03), each) for each in bounds))
-    result = diagnose({"pca-4": make(flat, principal_code(flat, 4))}, flat).encoders["pca-4"]
-    assert set(result.reconstruction.features[2].r2) == {None}
-    assert result.scores["times_pca"].value == pytest.approx(1, rel=1e-3)
-
-
-def still_height(data, rows):
-    observation = data.dataset["observation"][rows].copy()
-    observation[:, 2] = 0.03
-    return observation
 
 
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
@@ -420,35 +328,18 @@ def test_an_evaluation_is_one_file_and_repeats(data, tmp_path):
     assert "nan" not in evaluation_text(there)
 
 
-def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
-    collected, tmp_path, monkeypatch
-):
+def test_the_command_says_which_encoders_were_taken(collected, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr(figures, "encoder_plots", lambda evaluation: [])  # they take seconds
-    shipped = find("pca-4", "face_direction")
-    save(shipped.with_header(name="dae-4"), Path("dae-4"))
-    chosen = ("--encoder", "dae-4", "./dae-4", "full")
-    command = ("evaluate", *chosen, "--data", collected, "--out", "judged")
-    shown = jbrep(*command).stdout
-    assert shown.startswith("Which code serves can't be said: of these 1,000 held-out steps")
-    assert "Judged: dae-4, shipped; ./dae-4; full, shipped." in shown
-    assert "--all shows" in shown
-    assert max(map(len, shown.splitlines())) <= 80
-    assert len(shown.splitlines()) <= 32
+    monkeypatch.setattr("jbrep.evaluate.regression._STEPS", 20)
+    save(find("pca-4", "face_direction").with_header(name="dae-4"), Path("dae-4"))
+    chosen = ("--encoder", "dae-4", "./dae-4")
+    shown = jbrep("evaluate", *chosen, "--data", collected, "--out", "judged").stdout
+    assert "Judged: dae-4, shipped; ./dae-4." in shown
     evaluation = read_document(Path("judged", EVALUATION), Evaluation)
-    whole = evaluation_text(evaluation, 80, everything=True)
-    assert whole.startswith(shown.partition("\n\nJudged")[0])
-    assert "R² of the next latent" in whole
-    monkeypatch.setattr(diagnosis, "diagnose", lambda *given: evaluation)
-    again = jbrep(*command, "--json")
-    kept = json.loads(Path("judged", EVALUATION).read_text())
-    assert json.loads(again.stdout) == kept
-    labels = ["full", "dae-4, shipped", "./dae-4", "full, shipped"]
-    assert list(evaluation.encoders) == labels
-    assert "dae-4, shipped; ./dae-4; full, shipped" in again.stderr
+    assert list(evaluation.encoders) == ["full", "dae-4, shipped", "./dae-4"]
     Path("file").touch()
-    refused = jbrep(*command[:-1], "file")  # before anything is judged
+    refused = jbrep("evaluate", *chosen, "--data", collected, "--out", "file")
     assert (refused.exit_code, "can't make the folder file" in refused.stderr) == (2, True)
 
 

@@ -22,9 +22,8 @@ from jbrep.envs.description import describe
 from jbrep.evaluate import regression
 from jbrep.play.sources import find_player
 from jbrep.rl import Run, train
-from jbrep.rl.controller import load_policy
-from jbrep.rl.export import export
-from jbrep.rl.shipped import find
+from jbrep.rl.controller import export, load_policy
+from jbrep.rl.policy_file import find_shipped as find
 from jbrep.study.runner import BACKENDS
 
 OWN = Path("examples/own/own.py").resolve()

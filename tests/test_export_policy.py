@@ -13,7 +13,7 @@ from test_controller import TASK, controller_of, difference_over_an_episode, ran
 from jbrep.envs.description import describe
 from jbrep.errors import InputError
 from jbrep.rl import Run, train
-from jbrep.rl.export import described, export
+from jbrep.rl.controller import described, export
 
 KINDS = [("sac", "symmetry"), ("ppo", "coordinates"), ("td3", "dae-8"), ("crossq", "full")]
 
@@ -106,13 +106,6 @@ def test_mistakes_are_a_line(run, tmp_path):
     del changed.metadata_props[:]
     onnx.save(changed, other)
     assert f"{other} isn't a policy that jbrep policy export wrote" in mistake(*checking, other)
-
-
-def test_a_policy_of_another_task_is_refused_where_sizes_are_alike(tmp_path):
-    model = tmp_path / "it.onnx"
-    jbrep("policy", "export", "trained", "--task", "move_in_direction", "--out", model)
-    said = mistake("policy", "check", model, "--task", "move_to_pose", "--episodes", 1)
-    assert f"{model} was made for move_in_direction, not for move_to_pose" in said
 
 
 def test_an_encoder_that_is_code_cannot_be_exported(tmp_path):

@@ -3,26 +3,16 @@
 import csv
 import io
 from dataclasses import replace
-from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
-from judged import NOTHING, diagnostics, evaluation, prediction
+from judged import NOTHING, diagnostics, evaluation
 from made_up import drawn, found_of
-from matplotlib.text import Text
 from PIL import Image
 
-from jbrep.evaluate.evaluation import (
-    Evaluation,
-    FeatureError,
-    Prediction,
-    Reconstruction,
-    Score,
-)
-from jbrep.records.document import read_document
+from jbrep.evaluate.evaluation import FeatureError, Prediction, Reconstruction, Score
 from jbrep.report.figures import encoder_plots, study_plots, write
-from jbrep.report.figures.panels import COLUMN, PAGE, PAPER, fitting, line, panels, styles
+from jbrep.report.figures.panels import COLUMN, PAGE, PAPER, fitting
 from jbrep.report.findings import Verdict
 from jbrep.stats import RunCurve, analyse
 
@@ -107,27 +97,6 @@ def test_curves_are_the_medians_of_the_statistics(plots, found):
     assert bands[0].y1 == pytest.approx(max(group.agents[0].curve["p90"]))
 
 
-def test_policies_stand_beside_curves_of_the_same_starts_alone(plots):
-    """Of more starts than the curves have, they would be other numbers."""
-    (told,) = [
-        p
-        for p in study_plots(found_of(analyse(list(runs())), runs()))
-        if p.name == "representations"
-    ]
-    for plot, is_beside in ((plots["representations"], True), (told, False)):
-        lines = (line for axes in drawn(plot).axes for line in axes.lines)
-        assert any(line.get_label() == "hand-written" for line in lines) is is_beside
-
-
-def test_legends_say_how_many_runs_there_are(plots):
-    for name in ("representations", "profiles"):
-        (legend,) = drawn(plots[name]).legends
-        texts = {text.get_text() for text in legend.get_texts()}
-        assert {"full (n = 4)", "dae-8 (n = 3\N{EN DASH}4)"} <= texts
-    names = [text.get_text() for text in drawn(plots["final_return"]).axes[0].get_xticklabels()]
-    assert names == ["full (n = 4)", "dae-8 (n = 3\N{EN DASH}4)", "pca-4 (n = 4)"]
-
-
 def test_a_representation_has_one_colour_in_all_figures(found):
     """Also where the statistics leave out a representation that comes before it."""
     fewer = of_runs([run for run in runs() if run.representation != "dae-8"])
@@ -154,47 +123,6 @@ def of_runs(some, played=IN_TRAINING):
 def of_first_group(name):
     key = (*GROUPS[0], name)
     return [run for run in runs() if (run.task, run.algorithm, run.representation) == key]
-
-
-def check_apart(figure, words, count):
-    """Check that so many texts with these words don't overlap."""
-    boxes = [t.get_window_extent() for t in figure.findobj(Text) if words in t.get_text()]
-    assert len(boxes) == count
-    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
-
-
-@pytest.mark.parametrize(("word", "tilted"), [("dae-{}", False), ("forward-{}-symmetry", True)])
-def test_names_of_representations_do_not_run_into_each_other(word, tilted):
-    full = of_first_group("full")
-    names = ["full", word.format(8), word.format(4)]
-    three = [replace(run, representation=name) for name in names for run in full]
-    final, *_ = study_plots(of_runs(three))
-    labels = [text for text in final.figure.axes[0].get_xticklabels() if text.get_text()]
-    assert {text.get_rotation() for text in labels} == {30.0 if tilted else 0.0}
-    if not tilted:
-        boxes = [text.get_window_extent() for text in labels]
-        assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
-
-
-def test_titles_of_many_algorithms_do_not_overlap():
-    full = of_first_group("full")
-    many = [replace(run, algorithm=f"algorithm-{number}") for number in range(6) for run in full]
-    (curves,) = [p for p in study_plots(of_runs(many)) if p.name == "representations"]
-    check_apart(curves.figure, "algorithm-", 6)
-
-
-def test_a_study_of_many_representations_can_be_read():
-    """Legends don't take the room of panels, and no two lines look alike."""
-    full, other = of_first_group("full"), of_first_group("dae-8")
-    names = [f"another-one-{number}" for number in range(15)]
-    many = [replace(run, representation=name) for name in names for run in other]
-    for plot in study_plots(of_runs(full + many)):
-        if plot.name != "every_run":
-            figure = plot.figure
-            heights = [axes.get_window_extent().height / figure.dpi for axes in figure.axes]
-            assert min(heights) > 0.8, plot.name
-    colours = {look["color"] for look in styles(["full", *names], "full").values()}
-    assert len(colours) == 16
 
 
 def test_every_run_is_drawn(plots, found):
@@ -236,7 +164,8 @@ def cut_marks(axes, markers):
 def test_no_interval_stretches_an_axis_and_cuts_are_marked(found):
     final, *_ = study_plots(with_numbers(found, "agents", "final_return_sd", (40, 2, 5000)))
     axes = drawn(final).axes[1]
-    assert axes.get_ylim()[1] < 400
+    largest = max(each.numbers["final_return_sd"].value for each in found.groups[0].agents)
+    assert axes.get_ylim()[1] < 4 * largest < 5000
     assert (0.16, axes.get_ylim()[1], "^") in cut_marks(axes, "v^")
     far = with_numbers(found, "agents", "final_return_mean", (500, -9000, 9000))
     axes = drawn(study_plots(far)[0]).axes[0]
@@ -282,14 +211,6 @@ def test_claims_stand_in_their_place_with_boundaries_and_what_was_tested(found):
     assert rows[0]["representation"] == "dae-8"
 
 
-def test_an_interval_far_beyond_or_without_an_end_is_drawn_to_the_edge(found):
-    far = (100.0, -1e9, 1e9)
-    axes, _ = difference_panel(with_numbers(found, "comparisons", "final_return_difference", far))
-    left, right = axes.get_xlim()
-    assert -2000 < left < right < 2000
-    assert {(left, 0, "<"), (right, 0, ">")} <= {*cut_marks(axes, "<>")}
-
-
 def test_limits_hold_what_is_near_and_not_what_is_far():
     returns = [-400.0, -100.0, np.nan]
     assert fitting(returns) == pytest.approx((-412, -88))
@@ -325,40 +246,6 @@ def test_names_and_policies_with_dollar_signs_are_no_formulas():
         of_runs([*of_first_group("full"), *odd], {"face_direction": {"$y^{": 300.0}})
     ):
         drawn(plot).canvas.draw()
-
-
-def test_a_panel_is_drawn_for_each_facet_and_a_mark_for_each_series():
-    rows = [
-        {"part": part, "name": name, "x": x, "y": x * len(name)}
-        for part in "ab"
-        for name in ("one", "three")
-        for x in range(3)
-    ]
-    figure = panels(
-        rows,
-        mark=line("x", "y"),
-        looks=styles(("one", "three")),
-        facet=("part",),
-        series="name",
-        axis_labels=("x", "part"),
-        lines={("a",): {"two": 2.0}},
-        limits={("b",): (0.0, 9.0)},
-    )
-    left, right = figure.axes
-    assert [line.get_label() for line in left.lines] == ["two", "one", "three"]
-    assert [*left.lines[2].get_ydata()] == [0, 5, 10]
-    assert right.get_ylim() == (0, 9)
-    assert (left.get_ylabel(), right.get_ylabel()) == ("a", "b")  # the name of a column
-
-
-def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
-    whole = read_document(Path("results/encoders/face_direction/evaluation.json"), Evaluation)
-    encoders = {name: whole.encoders[name] for name in ("full", "dae-12", "dae-8", "pca-8")}
-    found = {plot.name: plot for plot in encoder_plots(whole.replace(encoders=encoders))}
-    assert [*found] == ["prediction_by_feature", "prediction_by_horizon", "error_by_feature"]
-    loses = encoders["dae-8"].reconstruction.features
-    assert values(found["error_by_feature"], "r2", encoder="dae-8") == [f.r2.value for f in loses]
-    assert len(write(found.values(), tmp_path)) == 3
 
 
 def test_of_a_wide_robot_the_worst_features_are_shown():
@@ -419,10 +306,3 @@ def test_predictions_stand_by_feature_and_encoder():
     ]
     expected = [[0.9, 0.8, 0.1], [np.nan] * 3, [0.9, 0.8, 0.1], [0.45, 0.4, 0.05]]
     np.testing.assert_array_equal(axes.images[0].get_array(), expected)
-
-
-def test_an_interval_far_below_nothing_leaves_predictions_readable():
-    wild = prediction(0.2, reward=Score(0.1, -138.0, 0.3))
-    plots = encoder_plots(evaluation({"full": diagnostics(prediction={"1": wild})}))
-    axes = drawn({plot.name: plot for plot in plots}["prediction_by_horizon"]).axes[0]
-    assert axes.get_ylim() == (-0.1, 1.03)

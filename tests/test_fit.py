@@ -3,10 +3,7 @@
 import re
 import shutil
 import signal
-import tracemalloc
-from contextlib import contextmanager
 from importlib import import_module
-from itertools import product
 from pathlib import Path
 from pkgutil import iter_modules
 
@@ -15,32 +12,26 @@ import pytest
 import torch
 from command import jbrep, start, wait_for
 from small import write_again
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensors import torch_threads
 from threadpoolctl import threadpool_limits
 from wide import wide
 
 from jbrep import methods
-from jbrep.dae import DAE
 from jbrep.dataset import Dataset, ScaledDataset, from_arrays
-from jbrep.dataset.scaling import SCALINGS
-from jbrep.encoders import find, load
+from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.reconstruction import reconstruction
-from jbrep.methods import fit
-from jbrep.methods.controls import Full
+from jbrep.methods.autoencoder import DAE
 from jbrep.methods.fit import Fitter
-from jbrep.methods.held_out import lost, ratio_to_pca
-from jbrep.methods.registry import METHODS, name_of, read_name
+from jbrep.methods.linear import lost, ratio_to_pca
+from jbrep.methods.registry import METHODS, read_name
 from jbrep.records.lock import exclusive
-from jbrep.training import checkpoint
 from jbrep.training.method import USUAL
-from jbrep.training.rows import available_memory
 from jbrep.training.trainer import Schedule, Trainer
-from jbrep.training.windows import Windows, watched_windows
+from jbrep.training.windows import Windows
 
-RECONSTRUCTING = ("full", "pca", "random", "untrained", "ae", "dae")
+RECONSTRUCTING = ("full", "pca", "dae")
 
 
 def how(kind="dae", **changes):
@@ -83,24 +74,6 @@ def test_every_method_is_registered():
         for method in vars(import_module(each.name)).values():
             if "name" in getattr(method, "__dict__", {}) and hasattr(method, "check_data"):
                 assert METHODS[method.name] is method
-
-
-@pytest.mark.parametrize(
-    "method", [m for m in METHODS.values() if not m.takes("features") and not issubclass(m, Full)]
-)
-def test_a_name_says_the_settings_that_it_was_made_of(method):
-    choices = {
-        "latent": (8,),
-        "architecture": ("paper", "deep", "64x32"),
-        "scaling": SCALINGS,
-        "on": ("observation", "angles", "symmetry"),
-        "codes": ("raw", "standard", "white"),
-    }
-    taken = {name: values for name, values in choices.items() if method.takes(name)}
-    for values, preset in product(product(*taken.values()), ({}, *method.presets.values())):
-        made = method.of({**dict(zip(taken, values, strict=True)), **preset})
-        recipe = read_name(name_of(made))
-        assert recipe.method.of(recipe.given) == made
 
 
 def test_names_of_no_encoder_are_refused_and_a_name_of_ones_own_is_free(data, tmp_path):
@@ -176,33 +149,6 @@ def test_only_one_may_train_it(data, tmp_path):
         assert fitter.fit(kind, **given).is_new
 
 
-def test_what_another_process_finished_before_the_lock_is_left_as_it_is(
-    data, tmp_path, monkeypatch
-):
-    @contextmanager
-    def after_another(path, beside):
-        with monkeypatch.context() as patch:
-            patch.setattr(fit, "exclusive", exclusive)
-            Fitter(data, tmp_path).fit("dae", **how())
-        with exclusive(path, beside=beside):
-            yield
-
-    monkeypatch.setattr(fit, "exclusive", after_another)
-    fitter = Fitter(data, tmp_path)
-    fitted = fitter.fit("dae", **how())
-    assert not fitted.is_new
-    events = EventAccumulator(str(tmp_path / "dae-4.training")).Reload()
-    for name in ("train_loss", "test_loss"):
-        assert [e.step for e in events.Scalars(name)] == [1, 2, 3]  # once
-    assert not (tmp_path / "dae-4.training" / "checkpoint.safetensors").exists()
-
-
-def test_rows_that_do_not_fit_in_memory_give_the_same_file(data, tmp_path):
-    one = Fitter(data, tmp_path / "memory").fit("dae", **how()).path
-    other = Fitter(data, tmp_path / "disk", memory=1000).fit("dae", **how()).path
-    assert one.read_bytes() == other.read_bytes()
-
-
 def pooled(data, memory, pool, **how):
     """A trainer of a dae that shuffles the data in pools far smaller than they are."""
     objective = DAE(latent=4).objective(data)
@@ -215,28 +161,9 @@ def trained(data, memory, epochs, path=None):
     """A trainer that is done, perhaps from a checkpoint."""
     trainer = pooled(data, memory, 1 << 20, batch_size=256, epochs=epochs)
     if path:
-        checkpoint.restore(trainer, {}, path)
+        trainer.restore({}, path)
     list(trainer.epochs())
     return trainer
-
-
-def test_a_checkpoint_of_a_large_network_can_be_read(tmp_path):
-    data = wide([60] * 4, features=40, folder=tmp_path)
-    large = DAE.of({"latent": 4, "architecture": "900,900"})
-    trainers = [
-        Trainer(
-            large.objective(data),
-            Schedule(learning_rate=5e-4, batch_size=64, epochs=1),
-            Windows(data, data.train, memory=1 << 30),
-            Windows(data, data.test, memory=0, most=9),
-        )
-        for _ in range(2)
-    ]
-    list(trainers[0].epochs())
-    checkpoint.save(trainers[0], {}, tmp_path / "at")
-    assert (tmp_path / "at").stat().st_size > 1 << 24
-    checkpoint.restore(trainers[1], {}, tmp_path / "at")
-    assert trainers[1].history == trainers[0].history
 
 
 def test_a_training_from_disk_is_that_from_memory_and_resumes_in_either(tmp_path):
@@ -244,40 +171,11 @@ def test_a_training_from_disk_is_that_from_memory_and_resumes_in_either(tmp_path
     memory, disk = (trained(data, limit, epochs=2) for limit in (1 << 30, 1 << 18))
     assert memory.history == disk.history
     for limit in (1 << 30, 1 << 18):
-        checkpoint.save(trained(data, limit, epochs=1), {}, tmp_path / "at")
+        trained(data, limit, epochs=1).save({}, tmp_path / "at")
         for other in (1 << 30, 1 << 18):
             resumed = trained(data, other, 2, tmp_path / "at")
             for name, parameter in memory.objective.state_dict().items():
                 assert torch.equal(resumed.objective.state_dict()[name], parameter)
-
-
-def test_training_from_disk_takes_little_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.dataset.columns._CHUNK_NUMBERS", 1 << 16)
-    data = wide([500] * 40, folder=tmp_path)
-    size = data.train.size * 348 * 4
-    peaks = []
-    for memory in (1 << 30, 1 << 20):
-        tracemalloc.start()
-        list(pooled(data, memory, 1 << 22, batch_size=128, epochs=1).epochs())
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[0] > size > 10 * peaks[1]
-
-
-def test_half_of_the_free_memory_is_taken_but_at_least_a_gibibyte(monkeypatch):
-    for free, taken in ((8 << 30, 4 << 30), (1 << 20, 1 << 30)):
-        told = f"MemTotal: {1 << 40} kB\nMemFree: 7 kB\nMemAvailable: {free >> 10} kB\n"
-        monkeypatch.setattr(Path, "read_text", lambda path, told=told: told)
-        assert available_memory(torch.device("cpu")) == taken
-    monkeypatch.setattr(Path, "read_text", lambda path: "")  # of another system
-    sizes = {"SC_PHYS_PAGES": 1 << 22, "SC_PAGE_SIZE": 1 << 12}
-    monkeypatch.setattr("os.sysconf", sizes.__getitem__)
-    assert available_memory(torch.device("cpu")) == 8 << 30
-
-
-def test_fewer_held_out_rows_of_a_wide_robot_are_watched(monkeypatch):
-    monkeypatch.setattr("jbrep.training.windows._WATCHED_NUMBERS", 348 * 30)
-    assert len(watched_windows(wide([50] * 10), 0, torch.device("cpu"))) == 30
 
 
 @pytest.mark.parametrize("kind", RECONSTRUCTING)
@@ -335,17 +233,6 @@ def test_on_symmetry_an_encoder_is_compared_over_what_symmetry_tells(data, tmp_p
     assert errors[0].sum() / errors[1].sum() < 0.95 * expected
 
 
-def test_a_quaternion_of_the_other_sign_is_no_error(data):
-    """Of a robot that heads backwards, where w changes its sign, turned by a hair."""
-    place = data.task.groups["orientation"]
-    rows = np.repeat(data.dataset["observation"][:1], 2, axis=0)
-    for row, angle in zip(rows, (np.pi - 0.01, np.pi + 0.01), strict=True):
-        row[place] = np.cos(angle / 2), 0, 0, np.sin(angle / 2)
-    ours = find("coordinates", data.task)
-    turned = ours.decode(ours.encode(rows[::-1]))
-    assert np.abs(ours.comparable(turned, rows) - rows)[:, place].max() < 0.02
-
-
 def test_where_pca_loses_nothing_there_is_no_ratio(tmp_path):
     random = np.random.default_rng(0)
     moving = random.normal(size=(400, 3))
@@ -369,29 +256,6 @@ def test_an_encoder_has_the_same_bytes_whatever_the_number_of_threads(kind, data
     assert made[0].read_bytes() == made[1].read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("kind", "far", "advice"),
-    [("slow", "lags", "a smaller lag"), ("linear-forward", "horizons", "smaller horizons")],
-)
-def test_rows_so_far_apart_that_too_few_pairs_are_left_are_refused(
-    kind, far, advice, data, tmp_path
-):
-    said = f"has 4 pairs of rows 999 steps apart to learn from, which .*: give {advice}, or more"
-    with pytest.raises(InputError, match=said):
-        Fitter(data, tmp_path).fit(kind, latent=4, **{far: (999,)})
-
-
-@pytest.mark.parametrize("kind", ["pca", "dae", "fourier", "ofe"])
-def test_keeping_everything_leaves_nothing_to_encode(kind, data, tmp_path):
-    with pytest.raises(InputError, match="no feature to encode beside what is kept, too few: use"):
-        Fitter(data, tmp_path).fit(kind, latent=8, keep=("*",))
-
-
-def test_the_header_has_the_batch_size_that_was_chosen(data, tmp_path):
-    training = Fitter(data, tmp_path).fit("dae", **how(batch_size=None)).encoder.header.training
-    assert training["batch_size"] == 128
-
-
 def test_the_command_takes_sizes_in_any_form_and_says_what_each_is_good_for(
     collected, tmp_path, monkeypatch
 ):
@@ -405,8 +269,6 @@ def test_the_command_takes_sizes_in_any_form_and_says_what_each_is_good_for(
     for kind, expected in (
         ("pca", r"reconstructs held-out states with a mean squared error of 0\.\d+"),
         ("slow", r"changes slowly: units correlate [01]\.\d\d to -?0\.\d\d with themselves"),
-        ("linear-forward", r"keeps \d+% of what a linear code can tell of what comes next"),
-        ("random", r"jbrep evaluate shows what it keeps"),
     ):
         told = " ".join(
             jbrep("train-encoder", "--kind", kind, "--latent", "3,", *out).stdout.split()
@@ -414,10 +276,8 @@ def test_the_command_takes_sizes_in_any_form_and_says_what_each_is_good_for(
         assert re.match(f"{kind}-3: {expected}", told), told
     assert jbrep("train-encoder", "--kind", "full", *out).exit_code == 0
     assert load(tmp_path / "it" / "full.safetensors").name == "full"
-    for nonsense in ("8x", ",", "8,,4", "8;4"):
-        refused = jbrep("train-dae", "--latent", nonsense, *out)
-        assert refused.exit_code == 2
-        assert "latent" in refused.stderr
+    refused = jbrep("train-dae", "--latent", "8x", *out)
+    assert (refused.exit_code, "latent" in refused.stderr) == (2, True)
 
 
 def test_a_last_batch_of_one_row_ends_no_training(tmp_path):
@@ -425,14 +285,6 @@ def test_a_last_batch_of_one_row_ends_no_training(tmp_path):
     whole = ScaledDataset(Dataset(sample))  # 2,997 windows of training: 7 * 428 and one
     encoder = Fitter(whole, tmp_path).fit("ofe", latent=24, epochs=1, batch_size=428).encoder
     assert np.isfinite(encoder.encode(whole.dataset["observation"][:3])).all()
-
-
-def test_features_that_are_kept_dont_count_in_what_a_code_is_good_for(tmp_path):
-    sample = Path(__file__).parent.parent / "data/sample/face_direction"
-    kept = ("--latent", 2, "--keep", "motor_*", "--data", sample, "--out", tmp_path)
-    told = " ".join(jbrep("train-encoder", "--kind", "slow", *kept).stdout.split())
-    spectrum = load(tmp_path / "slow-2.safetensors").header.metrics["spectrum"]
-    assert f"units correlate {spectrum[0]:.2f} to {spectrum[1]:.2f} with" in told
 
 
 def test_other_settings_or_data_are_refused_and_nothing_is_lost(data, collected, tmp_path):

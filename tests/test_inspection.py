@@ -2,9 +2,7 @@
 
 import json
 import re
-import signal
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 import rerun as rr
 from command import jbrep, start, wait_for, wait_for_the_end_of
-from made_up import write_checkpoint, write_record
+from made_up import write_checkpoint
 from rerun.chunk import RrdReader
 from small import ONE_EACH
 
@@ -21,18 +19,16 @@ from jbrep.envs import describe
 from jbrep.envs.physics import Motion
 from jbrep.errors import InputError
 from jbrep.inspection import inspect
-from jbrep.inspection.blueprint import curves_layout
-from jbrep.inspection.episode import POINTS, SPACING, record_episode, sweep
+from jbrep.inspection.blueprint import traversal_layout
 from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot, rotate, shapes
 from jbrep.inspection.scene import contacts, shades
 from jbrep.inspection.signals import panels, principal_components
+from jbrep.inspection.subject import POINTS, SPACING, sweep
 from jbrep.play import jitterbug
 from jbrep.play.jitterbug import reward_terms
 from jbrep.play.sources import find_episode
-from jbrep.records.tables import write_rows
 from jbrep.rl import Run
-from jbrep.rl.files import EVALUATIONS, Evaluation, read_evaluations
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
 DAE = "jbrep/encoders/shipped/face_direction/dae-4.safetensors"
@@ -219,18 +215,6 @@ def test_what_is_decoded(entities, rollout):
     np.testing.assert_array_equal(shown, expected)  # not one for all times, which would win
 
 
-def test_what_is_rigid_is_sent_once(entities, robot):
-    """The decoded robot's legs are at rest: their poses are those of the model's."""
-    data = mujoco.MjData(robot.model)
-    mujoco.mj_kinematics(robot.model, data)
-    for body in robot.bodies[1:]:
-        name, moves = robot.names[body], robot.names[body] == "weight"
-        own, _ = poses(entities[f"/world/ghost/jitterbug/{name}"])
-        assert len(own) == (ROWS if moves else 1)
-        away = data.xpos[body] - data.xpos[robot.root]
-        np.testing.assert_allclose(own[0], away, atol=1e-7)
-
-
 def test_an_encoder_that_keeps_all_gives_the_robot_back(unchanged):
     found, true = read(unchanged), find_episode(POSE)
     place, turned = poses(found["/world/ghost/jitterbug"])
@@ -259,7 +243,7 @@ def test_principal_components():
     assert not principal_components(latent[:, :1])[:, 1].any()
 
 
-@pytest.mark.parametrize("recording", ["recorded", "unchanged", "traversed"])
+@pytest.mark.parametrize("recording", ["recorded", "traversed"])
 def test_recordings_are_small_and_bring_their_layout(recording, request):
     path = request.getfixturevalue(recording)
     assert path.stat().st_size < 4e6
@@ -312,15 +296,6 @@ def test_a_traversal_shows_what_each_unit_decodes_to(traversed, rollout):
         assert len(quaternion) == POINTS
 
 
-def test_coordinates_give_back_all_but_the_sign_of_a_quaternion(rollout, tmp_path):
-    turned = rollout.observation.copy()
-    turned[:, rollout.task.groups["orientation"]] *= -1
-    other = replace(rollout, observation=turned)
-    record_episode(other, tmp_path / "a.rrd", find("coordinates", rollout.task))
-    error = scalars(read(tmp_path / "a.rrd")["/error/total"])
-    assert np.abs(error).max() < 1e-3
-
-
 @pytest.fixture(scope="module")
 def short(folder):
     """Recordings of episodes of at most 30 steps under uniformly random actions."""
@@ -333,9 +308,8 @@ def short(folder):
     return make
 
 
-@pytest.mark.parametrize("name", ["Hopper-v5", "dm_control/cheetah-run-v0"])
-def test_any_robot_of_mujoco_is_recorded(name, short):
-    rollout, found = short(name, encoder="full")
+def test_any_robot_of_mujoco_is_recorded(short):
+    rollout, found = short("Hopper-v5", encoder="full")
     robot, rows = Robot(rollout.motion.model), len(rollout) + 1
     assert robot.names[robot.root] == "torso"
     data = mujoco.MjData(robot.model)
@@ -372,50 +346,6 @@ def test_a_robot_without_mujoco_shows_its_signals(short):
     assert scalars(found["/error/total"]).max() < 1e-6
     assert not any(path.startswith("/world") for path in found)
     assert f"- return: {rollout.episode_return:.1f}" in text(found["/provenance"])
-
-
-def test_a_time_step_that_is_not_known_leaves_the_steps(folder):
-    rollout = find_episode("uniform", 0, describe("Pendulum-v1", max_episode_steps=30))
-    rollout = replace(rollout, task=rollout.task.replace(timestep=None))
-    record_episode(rollout, folder / "steps.rrd", find("full", rollout.task))
-    entity = read(folder / "steps.rrd")["/observation/obs"]
-    assert entity["step"].to_pylist() == list(range(31))
-    assert "time" not in entity
-
-
-def test_a_note_stands_in_the_provenance_and_is_told(folder, monkeypatch, rollout):
-    differing = replace(rollout, motion=None, note="it differs here")
-    monkeypatch.setattr("jbrep.inspection.subject.find_episode", lambda *given: differing)
-    told = []
-    found = read(inspect(FACE, 1, out=folder / "note.rrd", tell=told.append))
-    assert told == ["it differs here"]
-    assert "- note: it differs here" in text(found["/provenance"])
-    assert not any(path.startswith("/world") for path in found)
-
-
-def test_the_provenance_says_what_differs_and_only_what_is_known(folder):
-    task = describe("Pendulum-v1", max_episode_steps=30, domain={"delay": "1..2"})
-    rollout, found = find_episode("uniform", 4, task), []
-    turned, unknown = rollout.reward[::-1].copy(), np.full(30, np.nan, np.float32)
-    others = replace(rollout, reward=turned), replace(rollout, seed=-1, reward=unknown)
-    paths = [folder / f"domain-{i}.rrd" for i in range(3)]
-    for each, path in zip((rollout, *others), paths, strict=True):
-        record_episode(each, path)
-        found.append(read(path))
-        assert "- domain: `delay=1..2`" in text(found[-1]["/provenance"])
-    assert len({*map(identity, paths)}) == 3  # also where only the order of rewards differs
-    for entities, known in zip(found, (True, True, False), strict=True):
-        told = text(entities["/provenance"])
-        assert ("- seed: " in told, "- return: " in told) == (known, known)
-        assert ("/reward/total" in entities) == known
-
-
-def test_a_traversal_of_any_robot_shows_series(folder):
-    task = describe("Pendulum-v1", max_episode_steps=30)
-    path = inspect("uniform", 0, task, "full", traverse=True, out=folder / "swept.rrd")
-    found = read(path)
-    assert scalars(found["/traverse/unit_2/decoded"]).shape == (POINTS, 3)
-    assert not any(each.startswith("/world") for each in found)
 
 
 def test_panels_have_few_lines_of_about_equal_number():
@@ -489,7 +419,7 @@ def test_bodies_that_stand_still_have_one_pose_and_bare_ones_no_shape(folder):
     recording = Recording("it", "shapes")
     times = [rr.TimeColumn("step", sequence=np.arange(3))]
     robot.draw(recording, "robot", times, robot.poses(motion), [1, 2, 3])
-    recording.write(folder / "shapes.rrd", curves_layout(["robot"], 2))
+    recording.write(folder / "shapes.rrd", traversal_layout(1, None, np.zeros((1, 3))))
     found = read(folder / "shapes.rrd")
     paths = ("a_b", "a_b/bare", "body_3")
     moving = {path: len(poses(found[f"/robot/{path}"])[0]) for path in paths}
@@ -511,75 +441,18 @@ def test_the_force_of_a_contact_is_the_one_on_the_robot():
     assert force[2] > 1
 
 
-def write_study(folder):
-    """Two representations with two runs each, of which one failed."""
-    random = np.random.default_rng(0)
-    for representation in ("full", "dae-8"):
-        for seed in (0, 1):
-            failed = (representation, seed) == ("dae-8", 1)
-            run = folder / "runs" / representation / f"seed-{seed}"
-            run.mkdir(parents=True)
-            settings = Run.of(
-                task="face_direction", encoder=representation, steps=300, seed=seed, preset="paper"
-            )
-            end = {"steps": 150, "reason": "it failed"} if failed else {"steps": 300}
-            steps = (0, 100) if failed else (0, 100, 200, 300)
-            starts = [(step, episode) for step in steps for episode in (0, 1)]
-            rows = [Evaluation(*start, float(random.uniform(0, 1000))) for start in starts]
-            tables = {EVALUATIONS: write_rows(run / EVALUATIONS, rows, Evaluation)}
-            write_record(run, settings, **end, tables=tables)
-    return folder
-
-
-def test_training_curves_are_the_evaluations(tmp_path):
-    study = write_study(tmp_path / "study")
-    found = read(inspect(str(study), out=tmp_path / "curves.rrd"))
-    curves = {}
-    for seed in (0, 1):
-        rows = read_evaluations(study / "runs" / "full" / f"seed-{seed}")
-        entity = found[f"/face_direction/sac/full/seed-{seed}"]
-        np.testing.assert_array_equal(entity["training_step"].to_numpy(), [0, 100, 200, 300])
-        curves[seed] = scalars(entity)[:, 0]
-        for step, mean in zip((0, 100, 200, 300), curves[seed], strict=True):
-            returns = [row.episode_return for row in rows if row.step == step]
-            assert mean == pytest.approx(np.mean(returns))
-    median = found["/face_direction/sac/full/median"]
-    np.testing.assert_allclose(scalars(median)[:, 0], (curves[0] + curves[1]) / 2)
-    failed = found["/face_direction/sac/dae-8/seed-1"]
-    assert failed["training_step"].to_pylist() == [0, 100, 150]
-    assert scalars(failed)[-1] == 0
-    median = found["/face_direction/sac/dae-8/median"]
-    assert median["training_step"].to_pylist() == [0, 100, 200, 300]
-    whole = scalars(found["/face_direction/sac/dae-8/seed-0"])
-    np.testing.assert_allclose(scalars(median)[2:], whole[2:] / 2)
-    runs = [entity for path, entity in found.items() if "seed" in path]
-    colours = {names(each)[0]: each["SeriesLines:colors"].to_pylist() for each in runs}
-    assert colours.keys() == {"full", "dae-8"}
-    assert colours["full"] != colours["dae-8"]
-    assert "| face_direction/sac/full | 2 |" in text(found["/provenance"])
-
-
-@pytest.mark.parametrize("name", ["dae-4", "full"])
-def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(name, tmp_path):
+def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(tmp_path):
     task = describe("face_direction", max_episode_steps=50)
     write_checkpoint(
         tmp_path,
-        Run.of(task, "a2c", encoder=name, preset="paper", **ONE_EACH),
+        Run.of(task, "a2c", encoder="dae-4", preset="paper", **ONE_EACH),
         12_000,
     )
     shown = read(inspect(str(tmp_path), out=tmp_path / "it.rrd"))
     assert f"# {tmp_path} at step 12,000" in text(shown["/provenance"])
-    assert ("/world/ghost/jitterbug" in shown) == (name == "dae-4")
+    assert "/world/ghost/jitterbug" in shown
     other = read(inspect(str(tmp_path), encoder="dae-8", out=tmp_path / "other.rrd"))
     assert "- encoder: dae-8 (dae)" in text(other["/provenance"])
-
-
-def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
-    by_name = inspect(encoder="dae-4", task=describe("face_direction"), out=tmp_path / "name.rrd")
-    by_file = inspect(DAE, out=tmp_path / "file.rrd")
-    ours, theirs = read(by_name), read(by_file)
-    assert "# uniform" in text(ours["/provenance"])
-    np.testing.assert_array_equal(scalars(ours["/latent/units"]), scalars(theirs["/latent/units"]))
 
 
 @pytest.mark.parametrize(
@@ -587,28 +460,17 @@ def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
     [
         ({}, "SOURCE"),
         ({"source": "tests"}, "tests is no data set"),
-        ({"source": "nowhere"}, "nowhere"),
         ({"source": FACE, "episode": 9}, "episode 9"),
         ({"source": FACE, "task": describe("move_to_pose")}, "move_to_pose"),
-        ({"source": FACE, "encoder": "dae-9"}, "dae-9"),
         ({"source": FACE, "traverse": True}, "--traverse"),
         ({"encoder": "dae-8"}, "--task"),
-        ({"source": "none.safetensors"}, "none.safetensors"),
         ({"source": POSE, "encoder": DAE}, "dae-4"),
         ({"source": FACE, "out": Path("README.md")}, "README.md"),
-        ({"source": FACE, "out": Path("docs")}, "docs"),
     ],
 )
 def test_mistakes(given, named):
     with pytest.raises(InputError, match=re.escape(named)):
         inspect(**given)
-
-
-def test_a_study_has_no_episodes(tmp_path):
-    study, task = str(write_study(tmp_path / "study")), describe("face_direction")
-    for given in ({"episode": 0}, {"encoder": "dae-8"}, {"traverse": True}, {"task": task}):
-        with pytest.raises(InputError, match="several runs"):
-            inspect(study, **given)
 
 
 def test_an_earlier_recording_is_overwritten_and_nothing_else(tmp_path):
@@ -659,23 +521,21 @@ def viewer(tmp_path, monkeypatch):
     return make
 
 
-@pytest.mark.parametrize("code", [0, 3])
-def test_the_viewer_is_rerun_itself_and_serves_this_machine_alone(code, viewer, brief, tmp_path):
-    told, out = viewer(f"sys.exit({code})"), tmp_path / "it.rrd"
+def test_the_viewer_is_rerun_itself_and_serves_this_machine_alone(viewer, brief, tmp_path):
+    told, out = viewer("sys.exit(3)"), tmp_path / "it.rrd"
     shown = jbrep("inspect", brief, "--out", out, "--view")
     assert json.loads(told.read_text())[1:] == ["--bind", "127.0.0.1", str(out)]
     served = jbrep("inspect", brief, "--out", out, "--serve")
     arguments = json.loads(told.read_text())[1:]
     assert arguments[:3] == ["--bind", "127.0.0.1", "--serve-web"]
     assert f"http://127.0.0.1:{arguments[4]}/" in served.output
-    assert (shown.exit_code, served.exit_code) == ((2, 2) if code else (0, 0))
+    assert (shown.exit_code, served.exit_code) == (2, 2)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_the_viewer_ends_with_jbrep(number, viewer, brief, tmp_path):
+def test_the_viewer_ends_with_jbrep(viewer, brief, tmp_path):
     """Also the program that Rerun's script starts, and also where jbrep can't say good-bye."""
     told = viewer("time.sleep(600)")
     with start("inspect", brief, "--out", tmp_path / "it.rrd", "--serve") as process:
         assert wait_for(told.exists, process)
-        process.send_signal(number)
+        process.kill()
     wait_for_the_end_of([json.loads(told.read_text())[0]], seconds=30)

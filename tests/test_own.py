@@ -11,8 +11,6 @@ import pytest
 import torch
 from command import jbrep, mistake, refused
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
-from judged import diagnostics
 from rerun.chunk import RrdReader
 from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
@@ -162,25 +160,6 @@ def test_a_module_is_used_in_evaluation_mode_and_left_as_it_was():
     module(torch.zeros(4, 3)).sum().backward()  # it can still learn
 
 
-def test_what_goes_in_and_out_is_copied():
-    class Careless:
-        """Spoils what it gets, and returns the same array each time."""
-
-        memory = np.zeros((300, 3), np.float32)
-
-        def encode(self, observation):
-            observation *= 2
-            kept = self.memory[: len(observation)]
-            kept[:] = observation
-            return kept
-
-    encoder, rows = as_encoder(Careless(), TASK), ROWS.copy()
-    one = encoder.encode(rows)
-    encoder.encode(rows * 0)
-    np.testing.assert_array_equal(rows, ROWS)
-    np.testing.assert_array_equal(one, 2 * ROWS)
-
-
 class _Failing:
     """Whose latent_size is abstract."""
 
@@ -296,23 +275,6 @@ def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
     assert [plot.name for plot in encoder_plots(alone)] == names
 
 
-def test_evaluate_takes_code(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "jbrep.evaluate.diagnosis._side_by_side",
-        lambda encoders, *given: ({name: diagnostics() for name in encoders}, {}),
-    )
-    monkeypatch.setattr("jbrep.report.figures.encoder_plots", lambda evaluation: [])
-    chosen = ("--encoder", "test_own:Half", "test_own:make_half", "dae-8")
-    command = ("evaluate", "--data", "data/sample/face_direction", "--out", tmp_path, *chosen)
-    told = jbrep(*command)
-    assert told.exit_code == 0, told.output
-    assert "Judged: test_own:Half, code; test_own:make_half, code; dae-8, shipped." in " ".join(
-        told.output.split()
-    )
-    assert "Perhaps not new to these episodes: test_own:Half, test_own:make_half" in told.output
-    assert "dae-8, shipped is given twice: leave one out" in mistake(*command, "dae-8")
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A short run on code, and one on an object."""
@@ -366,14 +328,6 @@ def test_a_run_on_an_object_needs_it_again(trained):
     assert "Half is not the encoder that the run in" in refused(load_run, folder, Half())
 
 
-def test_a_policy_by_name_needs_an_encoder_that_decodes():
-    played = ("evaluate-policy", "heuristic", "--episodes", 1, "--episode-steps", 20)
-    played += ("--task", "face_direction", "--encoder")
-    assert "heuristic on Whole, decoded" in jbrep(*played, "test_own:Whole").output
-    told = mistake(*played, "test_own:Half")
-    assert "Half has no decoder: a policy by its name acts on decoded" in told
-
-
 def test_a_run_whose_encoder_fails_keeps_its_checkpoint(tmp_path):
     spoilt = Spoilt(lambda rows: rows[:, :2] * np.nan, after=26)
     run = Run.of(task=TASK, algorithm="a2c", encoder=spoilt, steps=80, preset="paper", **ONE_EACH)
@@ -422,21 +376,6 @@ def test_latents_are_those_of_the_vec_env_to_the_bit(lanes):
     for lane, info in enumerate(infos):
         final = seen[3][0]["terminal_observation"] if lanes == 1 else seen[4]["final_obs"][lane]
         np.testing.assert_array_equal(final, info["terminal_observation"])
-
-
-@pytest.mark.parametrize("mode", AutoresetMode)
-def test_the_way_of_resetting_is_kept(mode):
-    lanes = {"num_envs": 2, "vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
-    many = gymnasium.make_vec("Pendulum-v1", max_episode_steps=3, **lanes)
-    plain = gymnasium.make_vec("Pendulum-v1", max_episode_steps=3, **lanes)
-    many = Encoded(many, Whole())
-    np.testing.assert_array_equal(many.reset(seed=1)[0], plain.reset(seed=1)[0] / 2)
-    for _ in range(3 if mode is AutoresetMode.DISABLED else 5):
-        ours, theirs = (each.step(np.ones((2, 1), np.float32)) for each in (many, plain))
-        np.testing.assert_array_equal(ours[0], theirs[0] / 2)
-        assert ("final_obs" in ours[4]) == ("final_obs" in theirs[4])
-        if "final_obs" in ours[4]:
-            np.testing.assert_array_equal(ours[4]["final_obs"][1], theirs[4]["final_obs"][1] / 2)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from jbrep.errors import InputError
 from jbrep.evaluate import control, diagnose, regression
 from jbrep.evaluate.control import GoodPolicy, PlayedEpisode, lost, needs, returns_to_go
 from jbrep.evaluate.diagnosis import networks
-from jbrep.evaluate.evaluation import Lost, Score
+from jbrep.evaluate.evaluation import Judged, Lost, Score
 from jbrep.evaluate.held_out import HeldOut, explained
 from jbrep.evaluate.prediction import (
     Steps,
@@ -29,11 +29,10 @@ from jbrep.evaluate.prediction import (
     usual_horizons,
 )
 from jbrep.evaluate.readout import probes
-from jbrep.evaluate.registry import Judged
 from jbrep.evaluate.regression import Networks, Problem, beside, fit
 from jbrep.evaluate.table import headline
 from jbrep.play.sources import find_good_policy
-from jbrep.report.evaluation import evaluation_text, in_words, judge
+from jbrep.report.evaluation import evaluation_text, judge
 
 NAMES = ("place", "speed", "load", "idle")
 STEPS, EPISODES = 60, 200
@@ -162,29 +161,6 @@ def test_what_is_dropped_shows_where_it_matters(evaluation):
     assert low < value < high
 
 
-def test_what_the_reward_depends_on_counts_by_how_much_it_does(evaluation, held_out, policy):
-    header = EncoderHeader(kind="full", name="full", environment=held_out.data.task)
-    full = Encoder(header, held_out.data.scaler, (), ())
-    learnt = networks(full, held_out, policy)
-    weights = dict(zip(NAMES, needs(full, held_out, policy, learnt).reward, strict=True))
-    assert max(weights, key=weights.get) == "place"
-    for entry in evaluation.encoders.values():
-        told = entry.prediction["10"]
-        expected = sum(weights[n] * told.features[n][0] for n in NAMES) / sum(weights.values())
-        assert told.rewarded[0] == pytest.approx(expected, rel=1e-4)
-
-
-def test_an_evaluation_is_told_in_one_screen(evaluation):
-    shown = evaluation_text(evaluation, 80)
-    assert max(map(len, shown.splitlines())) <= 80
-    assert len(shown.splitlines()) < 24
-    assert shown.startswith("Take without idle: ")
-    assert re.search(r"without load +load \((<0|0\.\d\d)\)\nwithout idle +nothing", shown)
-    assert re.search(r"\nfull +\d+ +0\.\d\d +0\.\d\d \[0\.\d\d, \d\.\d\d\] +0\.\d\d", shown)
-    assert re.search(r"\nwithout load .* no\n", shown)
-    assert re.search(r"\nwithout idle .* yes\n", shown)
-
-
 def test_the_smallest_code_without_a_loss_is_to_take_and_else_the_smallest(evaluation):
     good = evaluation.encoders["without idle"]
     lost = evaluation.encoders["without load"].loses
@@ -217,33 +193,6 @@ def test_nothing_is_said_where_it_cannot_be(evaluation):
     nothing = evaluation.replace(encoders=codes | {"full": full.replace(prediction=blind)})
     assert "next to nothing" in judge(nothing).unsaid
     assert evaluation.encoders["without load"].method == {"spectrum": [3.0, 1.0]}
-
-
-def test_the_nearest_code_tells_something_and_lacks_nothing_if_one_does(evaluation):
-    def telling(label, r2, loses=()):
-        known = evaluation.encoders[label]
-        ahead = known.prediction["10"].replace(rewarded=Score(r2))
-        return known.replace(prediction=known.prediction | {"10": ahead}, loses=loses)
-
-    lost = evaluation.encoders["without load"].loses
-    codes = {"full": telling("full", 0.9), "a": telling("noise", 0.4, lost)}
-    codes |= {"b": telling("noise", 0.3), "c": telling("noise", 0.05)}
-    for nearest in ("b", "a", None):
-        assert judge(evaluation.replace(encoders=codes)).nearest == nearest
-        codes.pop(nearest, None)
-
-
-def test_of_short_episodes_as_many_steps_count_as_are_known(evaluation):
-    shorter = {
-        label: known.replace(prediction={k: known.prediction[k] for k in ("1", "5")})
-        for label, known in evaluation.encoders.items()
-    }
-    judged = judge(evaluation.replace(encoders=shorter))
-    assert judged.take == "without idle"
-    assert "over 5 steps" in judged.by
-    blind = {label: known.replace(prediction={}) for label, known in shorter.items()}
-    none = evaluation.replace(encoders=blind, needs={})
-    assert judge(none).unsaid == "episodes are too short to look ahead"
 
 
 def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkeypatch):
@@ -336,16 +285,6 @@ def test_regression_finds_what_is_not_linear_and_repeats_to_the_last_bit(monkeyp
     assert again[1].tobytes() == twice[1].tobytes() == twice[0].tobytes()  # as if each were alone
 
 
-def test_regressions_side_by_side_are_of_their_own_values():
-    random = np.random.default_rng(0)
-    narrow, wide = random.normal(size=(9_000, 2)), random.normal(size=(12_000, 7))
-    problems = [Problem(narrow, narrow.prod(axis=1)[:, None]), Problem(wide, np.abs(wide[:, :3]))]
-    for predictor, problem in zip(fit(problems), problems, strict=True):
-        predicted = predictor(problem.values)
-        assert predicted.shape == problem.wanted.shape
-        assert r2_score(problem.wanted, predicted, multioutput="raw_values").min() > 0.9
-
-
 def test_angles_change_by_all_that_they_turn():
     spin = make_feature("spin", "rad", -np.pi, np.pi, True, "angle")
     task = make_task([spin, make_feature("place")], "Top-v0")
@@ -394,8 +333,3 @@ def test_needs_pass_from_what_is_rewarded_to_what_moves_it(held_out):
         Lost(name="b", kept=0.2, need=0.9),
         Lost(name="a", kept=0.2, need=0.5),
     )
-
-
-def test_features_have_names_for_readers():
-    assert in_words("face_direction", "angular_velocity_z") == "rate of yaw"
-    assert in_words("Other-v0", "angular_velocity_z") == "angular_velocity_z"

@@ -11,10 +11,9 @@ from wide import WideDataset, make_feature, make_task, wide
 from jbrep.dataset import ScaledDataset
 from jbrep.errors import InputError
 from jbrep.methods.fit import Fitter
-from jbrep.methods.forward import Forward, Predictors
+from jbrep.methods.forward import Forward
 from jbrep.methods.linear import principal_code
 from jbrep.methods.registry import get_method
-from jbrep.training.network import stack
 from jbrep.training.trainer import Schedule, Trainer
 from jbrep.training.windows import Windows
 
@@ -107,21 +106,6 @@ def test_targets_of_the_forward_code_stay_within_an_episode(data):
             change[angle] = (change[angle] + 1) % 2 - 1
             expected = [*change, *rows[ahead], rewards[:ahead].mean()]
             np.testing.assert_allclose(targets, expected, atol=1e-5)
-
-
-def test_predictors_are_separate_networks():
-    torch.manual_seed(0)
-    reads, inputs = (3, 7), torch.randn(7, 5)
-    predictors = Predictors(reads, 4)
-    for i, read in enumerate(reads):
-        alone = stack((read, 64, 64, 4), "linear")
-        linears = [module for module in alone if isinstance(module, torch.nn.Linear)]
-        for linear, weight, bias in zip(
-            linears, predictors.weights, predictors.biases, strict=True
-        ):
-            linear.weight.data = weight[i, :, : linear.in_features].detach().clone()
-            linear.bias.data = bias[i, :, 0].detach().clone()
-        torch.testing.assert_close(predictors(inputs)[i], alone(inputs[:read].T).T)
 
 
 @pytest.mark.parametrize("weights", [{"reward": 1, "values": 1}, {"inverse": 1}])

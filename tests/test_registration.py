@@ -15,7 +15,7 @@ from jbrep.encoders import find, load, save
 from jbrep.errors import InputError
 from jbrep.records.document import read_document
 from jbrep.rl.files import RUN, read_run, runs_below
-from jbrep.rl.shipped import file_of
+from jbrep.rl.policy_file import shipped_file
 from jbrep.study.config import Data, read_study
 from jbrep.study.plan import Plan
 from jbrep.study.prepare import prepare
@@ -87,7 +87,7 @@ def test_a_plan_is_written_down(tmp_path):
     assert str(path) in told.output
     assert registration.registered == study
     assert registration.encoders == {}
-    sha256 = hashlib.sha256(file_of("face_direction").read_bytes()).hexdigest()
+    sha256 = hashlib.sha256(shipped_file("face_direction").read_bytes()).hexdigest()
     assert registration.policies == {"data/face_direction/policy-0.safetensors": sha256}
     assert not registration.committed
     assert registration.versions.keys() >= {"jbrep", "torch", "stable-baselines3"}

@@ -4,23 +4,20 @@ import shutil
 
 import numpy as np
 import pytest
-from command import jbrep
 from small import settings
 
 from jbrep.collect import collect
 from jbrep.dataset import Dataset
-from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs import describe
 from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.lanes import Lanes
-from jbrep.errors import InputError
 from jbrep.play.sources import find_player, find_policy
 from jbrep.rl import Run, train
-from jbrep.rl.agent import Evaluator
+from jbrep.rl.agent import evaluate
 from jbrep.rl.files import EPISODES, POLICY, POLICY_ZIP, read_evaluations
-from jbrep.rl.from_zip import load_zip
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_file import read
+from jbrep.rl.policy_zip import load_zip
 from jbrep.rl.presets import sb3_class
 
 TASK = describe("face_direction", max_episode_steps=50)
@@ -77,17 +74,6 @@ def test_a_lane_that_diverges_while_an_action_is_held_waits_for_the_others():
     assert not moved[1].diverged[0]
 
 
-def test_the_environment_says_how_long_an_episode_was():
-    environment = JitterbugVecEnv(TASK, 2, action_repeat=30)
-    environment.reset()
-    for _ in range(2):
-        *_, done, infos = environment.step(np.ones((2, 1)))
-    assert done.all()
-    assert [info["control_steps"] for info in infos] == [50, 50]
-    with pytest.raises(InputError, match="the action repeat is 0: it must be at least 1"):
-        JitterbugVecEnv(TASK, 2, action_repeat=0)
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run with actions that are held."""
@@ -139,7 +125,7 @@ def test_whoever_plays_the_policy_holds_its_actions(run, tmp_path):
     assert moved.action_repeat == REPEAT
     agent = sb3_class("sac").load(run / POLICY_ZIP)
     assert agent.action_repeat == REPEAT
-    returns = Evaluator(Lanes(TASK, 3), moved.encoder, 3).outcome(agent).returns
+    returns = evaluate(agent, Lanes(TASK, 3), moved.encoder, 3).returns
     np.testing.assert_allclose(returns, last, atol=6e-4)
 
 
@@ -147,11 +133,3 @@ def assert_held(action):
     """An episode's actions change with each block, and in none."""
     changes = np.diff(action[:, 0]) != 0
     np.testing.assert_array_equal(changes, np.diff(BLOCKS) > 0)
-
-
-def test_a_repeat_out_of_range_is_refused_in_a_line(tmp_path):
-    common = ("rl", "--task", "face_direction", "--steps", 100, "--out", tmp_path / "run")
-    result = jbrep(*common, "--set", "action_repeat=0")
-    assert result.exit_code == 2
-    assert "action_repeat is 0" in " ".join(result.output.split())
-    assert not (tmp_path / "run").exists()

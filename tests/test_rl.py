@@ -4,35 +4,30 @@ import hashlib
 import io
 import json
 import pickle
-import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 import zipfile
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from small import assert_same_files, forge
-from stable_baselines3 import SAC
-from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
 
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
 from jbrep.envs.recording import Outcome, episode_returns
 from jbrep.errors import InputError
-from jbrep.records import container
 from jbrep.rl import Run, Session, StoppedError, train
-from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
-from jbrep.rl.bar import Bar
+from jbrep.rl.agent import evaluate, make_agent, make_env, training_seed
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, POLICY, read_evaluations, read_run
-from jbrep.rl.from_zip import load_zip
-from jbrep.rl.history import History
+from jbrep.rl.history import Bar, History
 from jbrep.rl.policy import load_run
 from jbrep.rl.presets import PRESETS, get_preset, sb3_class
 
@@ -97,34 +92,6 @@ def test_table_one_reaches_ppo():
 
 
 @pytest.mark.parametrize(
-    ("preset", "rate", "every", "gradient_steps", "batch", "starts", "units", "robots"),
-    [("modern", 3e-4, 4, 1, 256, 1000, 256, 1), ("wide", 1e-3, 1, 8, 512, 12_800, 128, 64)],
-)
-def test_the_usual_settings_reach_sac(
-    preset, rate, every, gradient_steps, batch, starts, units, robots
-):
-    sac = agent_of("sac", preset)
-    assert (sac.lr_schedule(1), sac.gamma, sac.ent_coef) == (rate, 0.99, "auto")
-    assert (sac.train_freq.frequency, sac.gradient_steps) == (every, gradient_steps)
-    assert (sac.batch_size, sac.learning_starts, sac.n_envs) == (batch, starts, robots)
-    assert (sac.replay_buffer.buffer_size * robots, sac.action_noise) == (1_000_000, None)
-    assert widths(sac.critic) == [units, units, 1] * 2
-    assert get_preset(preset, "sac").action_repeat == (2 if preset == "wide" else 1)
-
-
-def test_the_later_versions_settings_reach_sac_and_td3():
-    sac, td3 = agent_of("sac"), agent_of("td3")
-    for agent in (sac, td3):
-        assert agent.lr_schedule(1) == 1e-4
-        assert isinstance(agent.action_noise, NormalActionNoise)
-        assert (agent.action_noise._mu, agent.action_noise._sigma) == (0, 0.2)
-        assert widths(agent.actor)[:2] == [350, 250]
-    assert (sac.batch_size, sac.ent_coef) == (256, "auto")
-    assert (td3.learning_starts, td3.gradient_steps) == (10_000, 1000)
-    assert td3.train_freq.frequency == 1000
-
-
-@pytest.mark.parametrize(
     ("algorithm", "preset"),
     [(algorithm, name) for name, its in PRESETS.items() for algorithm in its],
 )
@@ -174,9 +141,10 @@ def test_evaluation_is_the_deterministic_policys_return():
     for _ in range(STEPS):
         latent = encoder(lanes.observation.astype(np.float32))
         total += lanes.step(agent.predict(latent, deterministic=True)[0]).reward
-    evaluator = Evaluator(Lanes(TASK, 2), encoder, 2)
+    lanes = Lanes(TASK, 2)
     for _ in range(2):  # the same episodes each time
-        np.testing.assert_allclose(evaluator.outcome(agent).returns, total, rtol=1e-5)
+        returns = evaluate(agent, lanes, encoder, 2).returns
+        np.testing.assert_allclose(returns, total, rtol=1e-5)
 
 
 def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path):
@@ -194,12 +162,6 @@ def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path)
     assert len({row[2] for row in rows}) > 4
 
 
-def test_runs_of_two_seeds_share_no_start_with_each_other_or_evaluation():
-    seeds = [training_seed(seed) for seed in range(1000)]
-    assert min(np.diff(sorted(seeds))) > 64
-    assert max(seeds) + 64 < EVALUATION_SEED
-
-
 def test_training_starts_from_these_seeds_whatever_the_agent_seeds(tmp_path, monkeypatch):
     reset, starts = VecMonitor.reset, []
     monkeypatch.setattr(VecMonitor, "reset", lambda env: starts.append(reset(env)) or starts[-1])
@@ -208,31 +170,16 @@ def test_training_starts_from_these_seeds_whatever_the_agent_seeds(tmp_path, mon
     assert [np.array_equal(start, expected) for start in starts if len(start) == 8] == [True]
 
 
-def test_the_full_observation_is_scaled_as_encoders_scale_it():
-    full, dae = find("full", TASK), find("dae-8", TASK)
-    env = make_env(TASK, 1, 7, full)
-    plain = Lanes(TASK, 1).reset([0], [7]).astype(np.float32)
-    np.testing.assert_allclose(env.reset(), dae.scaler.scale(plain), rtol=1e-5, atol=1e-6)
-
-
 def test_neither_threads_nor_clock_nor_process_change_a_bit(short, tmp_path):
     text = (
         "import time, torch; from pathlib import Path; from jbrep.rl import Run, Session, train\n"
         f"{IMPORTS}\n"
         "torch.set_num_threads(2)\n"
-        "for seconds in (0, 1 << 33):\n"  # zip files can't be dated before 1980 or after 2107
-        "    time.time = lambda: seconds\n"
-        f"    train({SHORT!r}, Path({str(tmp_path)!r}, str(seconds)))"
+        "time.time = lambda: 1 << 33\n"  # zip files can't be dated after 2107
+        f"train({SHORT!r}, Path({str(tmp_path)!r}))"
     )
     subprocess.run([sys.executable, "-c", text], check=True)
-    for seconds in (0, 1 << 33):
-        assert_same_run(short, tmp_path / str(seconds))
-
-
-def test_another_seed_is_another_run(short, tmp_path):
-    train(SHORT.replace(seed=1), tmp_path / "other")
-    with pytest.raises(AssertionError):
-        assert_same_run(short, tmp_path / "other")
+    assert_same_run(short, tmp_path)
 
 
 def test_a_finished_run_is_left_alone(short):
@@ -243,25 +190,7 @@ def test_a_finished_run_is_left_alone(short):
     assert {p: p.stat().st_mtime_ns for p in short.iterdir()} == before
 
 
-def test_a_run_that_another_process_has_just_finished_is_left_alone(short, tmp_path, monkeypatch):
-    folder = tmp_path / "run"
-
-    @contextmanager
-    def wait_for_another_process(_):
-        shutil.copytree(short, folder, dirs_exist_ok=True)
-        yield
-
-    monkeypatch.setattr("jbrep.rl.training.exclusive", wait_for_another_process)
-    monkeypatch.setattr("jbrep.rl.training.save", lambda *_: pytest.fail("it was trained again"))
-    assert train(SHORT, folder) == read_run(short)
-
-
-KILLED = {
-    "ddpg": Run.of(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK, preset="paper"),
-    "sac": Run.of(
-        task="Hopper-v5", preset="modern", steps=1100, evaluation_episodes=1, final_episodes=1
-    ),
-}
+KILLED = Run.of(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK, preset="paper")
 
 
 def kill(run, folder, checkpoints=2):
@@ -281,22 +210,13 @@ def kill(run, folder, checkpoints=2):
     return process.returncode, error[-2000:]
 
 
-@pytest.mark.parametrize("algorithm", KILLED)
-def test_a_killed_run_resumes_to_the_same_bits(algorithm, tmp_path):
-    run, folder = KILLED[algorithm], tmp_path / "killed"
+def test_a_killed_run_resumes_to_the_same_bits(tmp_path):
+    run, folder = KILLED, tmp_path / "killed"
     killed, error = kill(run, folder)
     assert killed == -signal.SIGKILL, error
-    written = (folder / "checkpoint.safetensors").read_bytes()
     train(run, folder, Session(save_every=0.05))
     train(run, tmp_path / "undisturbed")
     assert_same_run(tmp_path / "undisturbed", folder)
-    (tmp_path / "spoilt").mkdir()
-    spoilt = tmp_path / "spoilt" / "checkpoint.safetensors"
-    for content in (written[:-100], b"", pickle.dumps(run), written):
-        spoilt.write_bytes(content)
-        with pytest.raises(InputError, match=r"checkpoint\.safetensors is|holds another run: seed"):
-            train(run.replace(seed=9), tmp_path / "spoilt")
-    assert [p.name for p in spoilt.parent.iterdir() if p.suffix] == [spoilt.name]
 
 
 def test_a_run_that_is_asked_to_stop_writes_a_checkpoint_and_resumes_from_there(short, tmp_path):
@@ -313,40 +233,6 @@ def test_a_run_that_is_asked_to_stop_writes_a_checkpoint_and_resumes_from_there(
     assert steps == sorted(steps)
     assert steps.count(40) == 2  # where it stopped, and where it resumed
     assert_same_run(short, tmp_path)
-
-
-def test_ctrl_c_stops_the_command_with_a_checkpoint(tmp_path):
-    settings = ("--task", TASK.name, "--episode-steps", STEPS, "--evaluation-episodes", 1)
-    settings += ("--steps", "1M", "--out", tmp_path)
-    command = [sys.executable, "-c", "from jbrep.cli import main; main()", "rl"]
-    process = subprocess.Popen(
-        [*command, *map(str, settings)],
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        text=True,
-    )
-    while process.poll() is None and not (tmp_path / "tensorboard").exists():
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    lines = process.communicate(timeout=120)[1].splitlines()
-    assert process.returncode == 128 + signal.SIGINT, lines
-    assert any(line.startswith("stopping: writing a checkpoint") for line in lines)
-    told = re.fullmatch(r"stopped after ([\d,]+) steps; the same command resumes it", lines[-1])
-    header = container.read(tmp_path / "checkpoint.safetensors", "checkpoint")[1]
-    assert header["step"] == int(told[1].replace(",", ""))
-
-
-def test_a_second_signal_ends_the_command_at_once():
-    text = (
-        "import os, signal, time; from jbrep.cli.signals import stop_signals\n"
-        "with stop_signals() as received:\n"
-        "    os.kill(os.getpid(), signal.SIGTERM); print(len(received), flush=True)\n"
-        "    os.kill(os.getpid(), signal.SIGINT); time.sleep(60)"
-    )
-    process = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
-    assert process.returncode == -signal.SIGINT
-    assert process.stdout == "1\n"
-    assert "Ctrl-C again ends at once" in process.stderr
 
 
 def made_up(*means):
@@ -372,13 +258,7 @@ class Terminal(io.StringIO):
 
 @pytest.mark.parametrize(
     ("encoding", "means", "course"),
-    [
-        ("utf-8", [], "-"),
-        ("utf-8", [50.0], "▁ 50.0"),
-        ("utf-8", [-20.0, 50.0, 85.0, 120.0, 50.0], "▁▅▆█▅ 50.0"),
-        ("utf-8", [*range(100), 10_000.0], "▁▁▁▁▁▁▁▁▂█ 10,000"),
-        ("ascii", [0.0, 50.0], "50.0"),
-    ],
+    [("utf-8", [-20.0, 50.0, 85.0, 120.0, 50.0], "▁▅▆█▅ 50.0"), ("ascii", [0.0, 50.0], "50.0")],
 )
 def test_a_terminal_shows_the_course_of_the_return(encoding, means, course, monkeypatch):
     terminal = Terminal(encoding)
@@ -394,21 +274,8 @@ def test_a_terminal_shows_the_course_of_the_return(encoding, means, course, monk
         assert line.endswith(f" left, returns={course}")
 
 
-def test_the_rate_after_resuming_counts_the_steps_since():
-    history = made_up()
-    with closing(Bar(1000, "sac")) as bar:
-        bar.show(history, 500)
-        bar.show(history, 600)
-        assert (bar._progress.n, bar._progress.initial) == (600, 500)
-        bar.show(history, 1008)
-        assert (bar._progress.n, bar._progress.postfix) == (1000, "returns=final ones under way")
-        history.add(1000, Outcome(np.array([1.5, 2.5]), [{}, {}]))
-        bar.show(history, 1008)
-        assert bar._progress.postfix == "returns=2.00"
-
-
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
-@pytest.mark.parametrize("algorithm", ["ddpg", "sac", "ppo", "a2c", "trpo"])
+@pytest.mark.parametrize("algorithm", ["ddpg", "ppo"])
 def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
     preset = get_preset("paper", algorithm)
     kwargs = {**preset.algorithm_kwargs, "learning_rate": 1e30}
@@ -423,26 +290,6 @@ def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
     assert train(run, tmp_path / "wild") == result
     with pytest.raises(InputError, match="failed: it has no policy"):
         load_run(tmp_path / "wild")
-
-
-def test_a_run_tells_all_its_steps_before_its_last_evaluation(tmp_path):
-    told = []
-    run = Run.of(algorithm="ddpg", steps=1200, evaluate_every=600, **QUICK, preset="paper")
-    session = Session(lambda history, step: told.append((step, [0, *history.means][-1])))
-    train(run, tmp_path / "run", session)
-    evaluations = read_evaluations(tmp_path / "run")
-    means = [np.mean([e.episode_return for e in evaluations if e.step == s]) for s in (600, 1200)]
-    assert means[0] != means[1]
-    assert told[-2:] == [(1200, pytest.approx(means[0])), (1200, pytest.approx(means[1]))]
-
-
-def test_an_error_whose_words_sound_like_divergence_is_not_taken_for_it(tmp_path):
-    def watch(history, step):
-        raise ValueError("found invalid values: actions are not finite")
-
-    with pytest.raises(ValueError, match="found invalid values"):
-        train(SHORT, tmp_path, Session(watch))
-    assert not (tmp_path / "run.json").exists()
 
 
 class Trap:
@@ -486,39 +333,20 @@ def test_a_folder_without_one_of_its_files_is_named(name, message, short, tmp_pa
     assert "\n" not in str(error.value)
 
 
-def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
-    path = tmp_path / "agent.zip"
-    SAC("MlpPolicy", make_env(TASK, 1, 0, find("dae-8", TASK)), buffer_size=10).save(path)
-    with pytest.raises(InputError, match="runs as code when it is read; add --trust"):
-        load_zip(path, TASK, "sac", "dae-8", trust=False)
-    assert load_zip(path, TASK, "sac", "dae-8", trust=True).trained.task == TASK
-    for algorithm, encoder in (("sac", "dae-4"), ("ppo", "dae-8"), ("fly", "dae-8")):
-        with pytest.raises(InputError, match=r"isn't a|unknown algorithm|observes 8 numbers"):
-            load_zip(path, TASK, algorithm, encoder, trust=True)
-
-
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "named"),
     [
-        ({"task": "fly"}, "unknown task"),
-        ({"algorithm": "dqn"}, "unknown algorithm 'dqn': choose one of ddpg"),
-        ({"preset": "best"}, "unknown preset 'best': choose one of paper, modern, wide"),
-        (
-            {"preset": "wide"},
-            "preset wide is for ddpg, td3, sac, tqc, crossq, not a2c: choose one of paper, modern",
-        ),
-        ({"encoder": "dae-9"}, "no encoder 'dae-9'"),
-        ({"seed": 2**31}, "seed is 2147483648"),
-        ({"steps": 0}, "steps is 0"),
-        ({"steps": 10**23}, f"steps is {10**23}: it must be"),
-        ({"evaluate_every": -1}, "evaluate_every is -1"),
-        ({"evaluation_episodes": 10_001}, "evaluation_episodes is 10001"),
-        ({"evaluation_episodes": 3, "final_episodes": 2}, "final_episodes is 2: .* as many as"),
+        ({"task": "fly"}, "task"),
+        ({"algorithm": "dqn"}, "algorithm"),
+        ({"preset": "wide"}, "preset"),
+        ({"encoder": "dae-9"}, "encoder"),
+        ({"steps": 10**23}, "steps"),
+        ({"evaluation_episodes": 3, "final_episodes": 2}, "final_episodes"),
     ],
 )
-def test_what_cannot_be_run_is_refused(change, message, tmp_path):
+def test_what_cannot_be_run_is_refused(change, named, tmp_path):
     usual = {"algorithm": "a2c", "encoder": "dae-8", "steps": 80, **QUICK}
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=named):
         train(Run.of(**{**usual, **change}), tmp_path / "new")
     assert not (tmp_path / "new").exists()
 

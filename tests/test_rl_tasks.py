@@ -16,12 +16,11 @@ from jbrep.errors import InputError
 from jbrep.play.sources import find_player
 from jbrep.records import container
 from jbrep.rl import Run, Session, StoppedError, train
-from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.agent import evaluate, make_agent, make_env, training_seed
 from jbrep.rl.controller import load_policy
 from jbrep.rl.files import (
     CHECKPOINT,
     EPISODES,
-    EVALUATION_SEED,
     EVALUATIONS,
     FAILED,
     POLICY,
@@ -32,7 +31,6 @@ from jbrep.rl.files import (
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.rl.settings import CLASSES
-from jbrep.rl.training import standing_of
 
 CART = describe(cart.ID)
 PENDULUM, HOPPER = describe("Pendulum-v1", max_episode_steps=50), describe("Hopper-v5")
@@ -65,7 +63,7 @@ def episodes_of(folder):
 
 @pytest.mark.parametrize(
     ("task", "algorithm"),
-    [*((HOPPER, each) for each in CLASSES), (PENDULUM, "a2c"), (PENDULUM, "sac")],
+    [*((HOPPER, each) for each in CLASSES), (PENDULUM, "sac")],
     ids=lambda given: getattr(given, "slug", given),
 )
 def test_every_algorithm_changes_its_weights_on_any_task(algorithm, task, short_rollouts, tmp_path):
@@ -87,7 +85,7 @@ def test_every_algorithm_changes_its_weights_on_any_task(algorithm, task, short_
         assert max(row["length"] for row in episodes) < HOPPER.max_episode_steps
 
 
-@pytest.mark.parametrize("algorithm", ["a2c", "ppo", "trpo", "sac"])
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
 def test_the_units_of_actions_do_not_matter(algorithm, short_rollouts, tmp_path):
     """Pulses of 1,000 to 2,000 us would be clipped nearly always, were they not scaled."""
     played = []
@@ -108,12 +106,9 @@ def test_evaluations_are_in_the_order_of_their_starts():
     """Episodes of different lengths end in another order."""
     encoder = find("full", HOPPER)
     agent = make_agent("sac", get_preset("modern", "sac"), make_env(HOPPER, 1, 0, encoder), 0)
-    together = Evaluator(Lanes(HOPPER, 4), encoder, 4).outcome(agent).returns
+    together, alone = (evaluate(agent, Lanes(HOPPER, n), encoder, 4).returns for n in (4, 1))
     assert len(set(together.round(3))) == 4
-    for i, expected in enumerate(together):
-        evaluator = Evaluator(Lanes(HOPPER, 1), encoder, 1, EVALUATION_SEED + i)
-        (alone,) = evaluator.outcome(agent).returns
-        assert alone == pytest.approx(expected, rel=1e-4)
+    np.testing.assert_allclose(together, alone, rtol=1e-4)
 
 
 def test_training_is_told_of_terminations(tmp_path):
@@ -126,8 +121,11 @@ def test_training_is_told_of_terminations(tmp_path):
     assert not buffer.timeouts[:200].any()
 
 
-@pytest.mark.parametrize("task", [PENDULUM, HOPPER, CART], ids=lambda task: task.slug)
-@pytest.mark.parametrize("algorithm", ["a2c", "sac"])
+@pytest.mark.parametrize(
+    ("task", "algorithm"),
+    [(PENDULUM, "a2c"), (HOPPER, "sac")],
+    ids=lambda given: getattr(given, "slug", given),
+)
 def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, task, tmp_path):
     run = Run.of(task=task, algorithm=algorithm, preset="modern", steps=320, **ONE_EACH)
     one, other = tmp_path / "one", tmp_path / "other"
@@ -154,16 +152,6 @@ def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
         load_run(tmp_path)
 
 
-def test_the_command_says_that_an_environment_failed(tmp_path):
-    seed = training_seed(0)
-    command = ("rl", "--task", cart.ID, "--env", f"fail_seed={seed}", "--out", tmp_path / "run")
-    told = jbrep(*command, "--algorithm", "a2c", "--steps", 800, "--evaluation-episodes", 1)
-    assert told.exit_code == 1
-    (line,) = told.output.splitlines()
-    assert line.startswith("the run failed: Test/Cart-v0 failed at step 7 of the episode with seed")
-    assert line.isprintable()
-
-
 def broken(*_):
     raise EnvironmentFailedError("out of order")
 
@@ -181,9 +169,8 @@ def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
     assert not (tmp_path / RUN).exists()
 
 
-@pytest.mark.parametrize("algorithm", ["a2c", "sac"])
-def test_what_was_learned_outlives_an_environment_that_fails(algorithm, tmp_path, monkeypatch):
-    run = Run.of(task=CART, algorithm=algorithm, steps=160, preset="modern", **ONE_EACH)
+def test_what_was_learned_outlives_an_environment_that_fails(tmp_path, monkeypatch):
+    run = Run.of(task=CART, algorithm="sac", steps=160, preset="modern", **ONE_EACH)
     session = Session(save_every=0, keep_checkpoint=True)
     whole = train(run, tmp_path / "whole", session)
     count, step = iter(range(1 << 20)), Lanes.step
@@ -218,28 +205,9 @@ def test_an_environment_that_is_not_reproducible(tmp_path):
     assert (tmp_path / "stopped" / CHECKPOINT).exists()
 
 
-def test_arguments_and_time_limit_are_settings_of_a_run(tmp_path):
-    made = ("rl", "--task", "Pendulum-v1", "--env", "g=3.5", "--episode-steps", 40)
-    made = (*made, "--algorithm", "a2c", "--evaluation-episodes", 1, "--out", tmp_path / "run")
-    told = jbrep(*made, "--steps", 400)
-    assert told.exit_code == 0, told.output
-    assert "returns on full at the end: -" in told.output
-    run = read_run(tmp_path / "run")
-    task = describe("Pendulum-v1", {"g": 3.5}, 40)
-    assert run.settings.environment == task
-    assert {row["length"] for row in episodes_of(tmp_path / "run")} == {40}
-    again = ("--steps", 400, "--episode-steps", 50, "--env", "g=3.5")
-    told = jbrep("rl", "--task", "Pendulum-v1", *again, *made[7:])
-    assert told.exit_code == 2
-    assert "holds another run: " in told.output
-    assert "max_episode_steps 40 (now: 50); choose another folder" in told.output
-
-
 @pytest.mark.parametrize(
     ("algorithm", "overrides"),
     [
-        ("sac", {"learning_starts": 50}),
-        ("a2c", {"use_sde": True}),
         ("tqc", {"learning_starts": 50, "use_sde": True}),
         ("a2c", {"num_envs": 1}),  # one robot, whose episodes last 40 steps
     ],
@@ -260,14 +228,6 @@ def test_a_run_goes_on_as_one_that_had_more_steps_at_first(algorithm, overrides,
         train(Run.of(CART, steps=400, **settings), grown)
     with pytest.raises(InputError, match=r"holds another run: steps 320 \(now: 160\)"):
         train(shorter, grown)
-
-
-def test_a_run_on_a_schedule_does_not_go_on(tmp_path):
-    settings = {"algorithm": "a2c", **ONE_EACH}
-    settings |= {"overrides": {"learning_rate": "linear:1e-3"}}
-    train(Run.of(CART, steps=80, **settings), tmp_path, Session(keep_checkpoint=True))
-    with pytest.raises(InputError, match="its learning_rate fell to 0"):
-        train(Run.of(CART, steps=160, **settings), tmp_path)
 
 
 def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(tmp_path, monkeypatch):
@@ -295,24 +255,9 @@ def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(tmp_path, monkeypatch)
     assert_same_files(folder, whole, EPISODES, EVALUATIONS, POLICY)
 
 
-def test_a_run_that_was_stopped_can_go_on_with_more_steps(tmp_path):
-    """Its evaluations stay as far apart as they were."""
-    settings = {"algorithm": "a2c", **ONE_EACH}
-    with pytest.raises(StoppedError):
-        train(Run.of(CART, steps=200_000, **settings), tmp_path, Session(stop=lambda: True))
-    longer = Run.of(CART, steps=400_000, **settings)
-    for _ in range(2):
-        now = standing_of(longer, tmp_path)
-        assert now.resumes
-        assert now.settings.evaluate_every == 20_000
-        with pytest.raises(StoppedError):
-            train(longer, tmp_path, Session(stop=lambda: True))
-
-
-@pytest.mark.parametrize("normalize", [False, True])
-def test_one_robot_remembers_what_it_saw_before_an_evaluation(normalize, tmp_path):
+def test_one_robot_remembers_what_it_saw_before_an_evaluation(tmp_path):
     """An evaluation begins the next episode once more; no transition is made of two."""
-    overrides = {"num_envs": 1, "learning_starts": 1000, "normalize": normalize}
+    overrides = {"num_envs": 1, "learning_starts": 1000, "normalize": True}
     how = {"algorithm": "sac", "preset": "modern", "overrides": overrides}
     run = Run.of(CART, steps=100, evaluate_every=25, **how, **ONE_EACH)
     train(run.replace(one_robot=True), tmp_path, Session(keep_checkpoint=True))

@@ -25,9 +25,9 @@ from jbrep.envs.make import make_env
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError
 from jbrep.pool import Pool, WorkerError
-from jbrep.rl import Run, speed
+from jbrep.rl import Run
 from jbrep.rl.files import read_run
-from jbrep.rl.speed import estimate
+from jbrep.rl.run import estimate
 
 import_modules(["arms", "environments"])
 HOPPER = Path(gymnasium.__file__).parent / "envs/mujoco/assets/hopper.xml"
@@ -205,7 +205,7 @@ def test_a_class_describes_itself(made, monkeypatch):
 def test_an_estimate_is_of_steps_and_evaluations(algorithm, monkeypatch):
     """Where whatever is timed takes 5 seconds: some steps of learning, or an evaluation."""
     tried = []
-    monkeypatch.setattr(speed, "_seconds", lambda work: (tried.append(work()), 5.0)[1])
+    monkeypatch.setattr("jbrep.rl.run._seconds", lambda work: (tried.append(work()), 5.0)[1])
     task = describe("Pendulum-v1", max_episode_steps=20)
     run = Run.of(task, algorithm, steps=4000, evaluate_every=500, final_episodes=15)
     evaluations = 8 + 3  # the last has three times as many episodes

@@ -11,9 +11,8 @@ from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.envs import describe
 from jbrep.evaluate import diagnose, regression
 from jbrep.methods.fit import Fitter
-from jbrep.rl.controller import load_policy
-from jbrep.rl.export import export
-from jbrep.rl.shipped import find
+from jbrep.rl.controller import export, load_policy
+from jbrep.rl.policy_file import find_shipped as find
 
 EPISODES, STEPS = 30, 150
 TASK = describe("face_direction", max_episode_steps=STEPS)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from command import jbrep, mistake, refused
 from made_up import write_checkpoint
-from small import ONE_EACH, adopt, forge
+from small import ONE_EACH, forge
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jbrep.encoders import find, save
@@ -31,11 +31,11 @@ from jbrep.rl.files import (
     read_evaluations,
     read_run,
 )
+from jbrep.rl.history import Scalars
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_file import read
-from jbrep.rl.training import Scalars
 
-TASK = describe("face_direction")
+TASK = describe("face_direction", max_episode_steps=100)
 SETTINGS = Run.of(
     task=TASK,
     algorithm="a2c",
@@ -118,7 +118,6 @@ def changed(record, path, value):
     [
         (("steps",), ...),
         (("status",), "x"),
-        (("tables",), {}),
         (("settings", "seed"), -1),
         (("settings", "environment", "id"), "../../up"),
         (("settings", "hyperparameters", "num_envs"), 10**30),
@@ -141,26 +140,19 @@ def test_a_run_file_of_anything_else(content, run):
         mistake(*command)
 
 
-NO_EVALUATIONS = (
-    *("", "0,0", "0,0,1,2", "0,0,nan", f"{10**30},0,1", "-1,0,1", f"0,{10**8},1", "0,1,1"),
-    *("0,0,1\n0,1,1\n80,0,1", "80,0,1\n0,0,1", "0,0,1\n0,0,1", '0,0,"1', "\0"),
-)
-
-
-def test_evaluations_that_are_none(run):
-    for rows in NO_EVALUATIONS:
-        (run / EVALUATIONS).write_text(f"step,episode,return\n{rows}" if rows else "")
-        adopt(run / RUN, EVALUATIONS)
-        assert f"{EVALUATIONS} is damaged or " in refused(read_evaluations, run)
-    mistake("report", run)
-
-
 def test_weights_are_those_of_the_run(run):
     path, weights = run / POLICY, weights_of(run)
     container.write(path, weights | {"more": np.ones(1)}, container.read(path, "policy")[1])
     assert "its SHA-256 isn't in run.json" in refused(load_run, run)
     change(run, policy_sha256=None)
-    assert "it has finished, but policy_sha256 is None" in refused(load_run, run)
+    assert "no policy" in refused(load_run, run)
+
+
+def test_evaluations_are_those_of_the_run(run):
+    with (run / EVALUATIONS).open("a") as file:
+        file.write("90,0,1\n")
+    assert EVALUATIONS in refused(read_evaluations, run)
+    mistake("report", run)
 
 
 def without(tensors, name):
@@ -231,16 +223,7 @@ def test_a_run_under_way_plays_its_checkpoint(under_way, trained):
     assert told.startswith(f"{TASK.name} on dae-8 at step 40: median return ")
 
 
-def test_a_checkpoint_s_policy_is_the_agent_s_at_that_step(trained, tmp_path):
-    """A run that ends where the other's checkpoint was written has the same policy."""
-    train(SETTINGS.replace(steps=40), tmp_path)
-    ours = container.read(trained.with_name(CHECKPOINT), "checkpoint")[0]
-    for name, value in weights_of(tmp_path).items():
-        if name.startswith("policy."):
-            np.testing.assert_array_equal(ours[f"parameters.{name}"], value)
-
-
-@pytest.mark.parametrize("algorithm", ["ddpg", "sac", "ppo"])
+@pytest.mark.parametrize("algorithm", ["ddpg", "ppo"])
 def test_the_checkpoint_of_every_algorithm_is_played(algorithm, tmp_path):
     agent = write_checkpoint(
         tmp_path, Run.of(TASK, algorithm, encoder="dae-8", seed=3, preset="paper"), step=7
@@ -255,7 +238,7 @@ def test_the_checkpoint_of_every_algorithm_is_played(algorithm, tmp_path):
 
 
 def spoilt(header):
-    for name in ("settings", "counters", "episodes", "versions"):
+    for name in ("settings", "episodes"):
         yield {**header, name: "x"}
     yield {**header, "settings": {**header["settings"], "seed": 10**30}}
     yield {**header, "step": -1}
@@ -273,23 +256,6 @@ def test_a_damaged_checkpoint_is_named(under_way):
     assert CHECKPOINT in refused(load_run, under_way)
 
 
-def test_a_checkpoint_that_nothing_can_go_on_from_is_named(under_way):
-    path = under_way / CHECKPOINT
-    tensors, header = container.read(path, "checkpoint")
-    kind, *others = header["counters"]["numpy"]
-    counters = {**header["counters"], "numpy": [kind, 10**30, *others[1:]]}
-    container.write(path, tensors, {**header, "counters": counters})
-    assert f"{CHECKPOINT} is damaged: delete it to start over" in refused(
-        train, SETTINGS, under_way
-    )
-
-
-def test_a_run_without_a_checkpoint_so_far(under_way):
-    (under_way / CHECKPOINT).unlink()
-    assert f"{RUN} or {CHECKPOINT} is expected" in refused(load_run, under_way)
-    assert "has no checkpoint.safetensors yet" in mistake("evaluate-policy", under_way)
-
-
 def test_evaluating_a_run(run):
     shorten(run)
     by_folder = jbrep("evaluate-policy", run, "--episodes", 2).output
@@ -303,12 +269,6 @@ def test_evaluating_a_run(run):
     assert record["percentile_10"] == pytest.approx(np.percentile(record["returns"], 10))
     assert (len(record["returns"]), record["episodes"]) == (2, 2)
     assert "step" not in record
-
-
-def test_episodes_are_as_long_as_the_run_s(run):
-    shorten(run, 30)
-    (rollout,) = find_player(str(run)).play([0])
-    assert len(rollout) == 30
 
 
 def test_another_encoder_is_not_the_run_s(run):

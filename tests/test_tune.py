@@ -10,8 +10,8 @@ from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import POLICY, read_run, runs_below
+from jbrep.rl.history import Tracker
 from jbrep.rl.learner import read_preset
-from jbrep.rl.tracker import Tracker
 from jbrep.rl.tune import BEST, _space, tune
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)

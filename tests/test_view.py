@@ -15,7 +15,7 @@ from jbrep.envs import Lanes, describe
 from jbrep.envs.names import import_modules
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError
-from jbrep.rl.export import export
+from jbrep.rl.controller import export
 
 import_modules(["environments"])
 TASK = "move_in_direction"

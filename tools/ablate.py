@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.encoders import FULL, Encoder, find, save
-from jbrep.encoders.file import SUFFIX
+from jbrep.encoders.encoder import SUFFIX
 from jbrep.encoders.header import IMPORTED, EncoderHeader
 from jbrep.encoders.layers import Layer
 from jbrep.envs import describe

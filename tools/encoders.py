@@ -15,7 +15,7 @@ from typing import Any
 
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import FULL, load
-from jbrep.encoders.file import SUFFIX
+from jbrep.encoders.encoder import SUFFIX
 from jbrep.encoders.shipped import UNLEARNED
 from jbrep.envs.task import Task
 from jbrep.errors import InputError

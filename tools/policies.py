@@ -17,9 +17,8 @@ from jbrep.jitterbug.tasks import TASKS
 from jbrep.records.storage import write_whole
 from jbrep.records.tables import write_csv
 from jbrep.rl.files import EPISODES, FINISHED, last_returns, read_evaluations, read_run, runs_below
-from jbrep.rl.policy import load_run
-from jbrep.rl.shipped import COLUMNS, FOLDER, RETURNS, SHIPPED, Returns, file_of, shipped
-from jbrep.rl.trained import pack
+from jbrep.rl.policy import load_run, pack
+from jbrep.rl.policy_file import COLUMNS, FOLDER, RETURNS, SHIPPED, Returns, shipped, shipped_file
 from jbrep.stats.scale import LOOKING, STILL
 from jbrep.study.tables import REFERENCE_RETURNS, References, read_references, table_hashes
 
@@ -63,7 +62,7 @@ def main() -> None:
         if reached - least < most - reached:
             print(f"{task}: none shipped, as {run} returns about what standing still does")
             continue
-        write_whole(file_of(task), pack(load_run(run), SHIPPED))
+        write_whole(shipped_file(task), pack(load_run(run), SHIPPED))
         played[task] = {SHIPPED: np.array(learned), "heuristic": np.array(written)}
         print(f"{task}: {run}, {value:.0f} in training, at last; median {reached:.0f}")
     rows = (

@@ -18,9 +18,8 @@ import jbrep
 from jbrep.dataset import Layout, from_file
 from jbrep.play.exported import exported_player
 from jbrep.play.sources import find_player
-from jbrep.rl.controller import load_policy
-from jbrep.rl.export import export
-from jbrep.rl.shipped import find
+from jbrep.rl.controller import export, load_policy
+from jbrep.rl.policy_file import find_shipped as find
 
 EPISODES, LIMIT, STEPS = 40, 1000, 150_000
 OUT = Path("from-a-log")

@@ -227,8 +227,7 @@ def import_model(
         name: what tables will call it; by default the name of the file.
     """
     from jbrep.encoders.card import card
-    from jbrep.encoders.encoder import Encoder
-    from jbrep.encoders.file import SUFFIX, save_new
+    from jbrep.encoders.encoder import SUFFIX, Encoder, save_new
     from jbrep.records.storage import exists, taken
 
     if exists(out):

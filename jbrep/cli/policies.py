@@ -40,7 +40,7 @@ def policies(*, as_json: AsJson = False) -> None:
     Every command that takes a policy knows the one for its --task as trained, as in jbrep render
     trained --task face_direction --out walk.mp4.
     """
-    from jbrep.rl.shipped import SHIPPED, shipped
+    from jbrep.rl.policy_file import SHIPPED, shipped
 
     ships = shipped()
     if as_json:
@@ -89,10 +89,9 @@ def export(
     from jbrep.envs.description import describe
     from jbrep.envs.names import modules_of
     from jbrep.play.sources import policy_file
-    from jbrep.rl.controller import load_policy
-    from jbrep.rl.export import described
-    from jbrep.rl.export import export as write
-    from jbrep.rl.shipped import SHIPPED
+    from jbrep.rl.controller import described, load_policy
+    from jbrep.rl.controller import export as write
+    from jbrep.rl.policy_file import SHIPPED
 
     if task and policy != SHIPPED:
         raise InputError(
@@ -344,7 +343,7 @@ def _find(policy: str, task: "Task | None", encoder: str | None, **of_zip: Any) 
             f"no policy at {policy}: a folder of jbrep rl is needed, a zip file of "
             f"stable-baselines3, or a name: {sources.policy_names()}"
         )
-    from jbrep.rl.from_zip import load_zip  # imports torch
+    from jbrep.rl.policy_zip import load_zip  # imports torch
 
     algorithm = of_zip.pop("algorithm") or "sac"
     found = load_zip(path, task, algorithm, encoder, **of_zip)

@@ -25,25 +25,15 @@ _SAME = 1e-2  # by which a latent may differ in another batch, of the largest: r
 
 
 class BaseEncoder(ABC):
-    """What every stage uses of an encoder.
+    """What every stage uses of an encoder."""
 
-    Attributes:
-        name: what tables call it.
-        kind: how it was made, such as dae, pca, full, own.
-        task: whose observations it reads.
-        size: length d of an observation.
-        latent_size: length l of a latent.
-        can_decode: whether `decode` is possible.
-        fingerprint: SHA-256 that identifies it.
-    """
-
-    name: str
-    kind: str
-    task: Task
-    size: int
-    latent_size: int
-    can_decode: bool
-    fingerprint: str
+    name: str  # what tables call it
+    kind: str  # how it was made, such as dae, pca, full, own
+    task: Task  # whose observations it reads
+    size: int  # length d of an observation
+    latent_size: int  # length l of a latent
+    can_decode: bool  # whether `decode` is possible
+    fingerprint: str  # SHA-256 that identifies it
 
     def __repr__(self) -> str:
         kind = type(self).__name__
@@ -238,7 +228,6 @@ def _name(given: Any) -> str:
 
 
 def _as_array(result: Any) -> Float32:
-    """What an encoder returned as an array of its own."""
     if isinstance(result, (tuple, dict)):
         raise TypeError(f"it returned a {type(result).__name__} instead of one array")
     if hasattr(result, "detach"):

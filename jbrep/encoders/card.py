@@ -68,7 +68,6 @@ def card(encoder: BaseEncoder, source: str, width: int) -> str:
 
 
 def _read(encoder: Encoder) -> tuple[Feature, ...]:
-    """What it scales and encodes."""
     return encoder.scaler.features(encoder.task)
 
 

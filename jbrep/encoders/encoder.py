@@ -1,4 +1,7 @@
-"""The encoder: from observations to latents and back, through layers."""
+"""The encoder: from observations to latents and back, through layers; and its file.
+
+That is safetensors with a JSON header; reading one runs nothing in it.
+"""
 
 from importlib.metadata import version
 from pathlib import Path
@@ -6,21 +9,25 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, Union
 
 import numpy as np
 
-from jbrep.coordinates import is_torch, library_of
+from jbrep.coordinates import Coordinates, is_torch, library_of
 from jbrep.coordinates.nearest import nearest
 from jbrep.dataset import Scaler
 from jbrep.encoders.base import BaseEncoder, Float32, OwnEncoder
-from jbrep.encoders.header import IMPORTED, EncoderHeader
-from jbrep.encoders.layers import MAX_UNITS, Layer, check_tensor, run
+from jbrep.encoders.header import HELD_OUT_MSE, IMPORTED, EncoderHeader
+from jbrep.encoders.layers import MAX_UNITS, ONNX, Layer, check_tensor, run
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.records import container
+from jbrep.records.container import Tensors
+from jbrep.records.document import document_from
+from jbrep.records.storage import make_folder, write_new, write_whole
 
 if TYPE_CHECKING:
     from torch.nn import Module
 
     from jbrep.encoders.imported import Model  # imports onnx
 
+SUFFIX = ".safetensors"
 Layers = tuple[Union[Layer, "Model"], ...]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 
@@ -29,17 +36,13 @@ class Arrays(NamedTuple):
     """An encoder's arrays, all NumPy's or all torch tensors on one device, and what it computes.
 
     Written once for NumPy, torch and ONNX.
-
-    Attributes:
-        scaler: of observations.
-        encoder, decoder: layers.
-        kept: places of the scaled numbers that pass around the layers.
     """
 
-    scaler: Scaler
+    scaler: Scaler  # of observations
+    # encoder, decoder: layers
     encoder: Layers
     decoder: Layers
-    kept: list[int]
+    kept: list[int]  # places of the scaled numbers that pass around the layers
 
     def encode(self, observation: Any) -> Any:
         """Latents (..., l) of observations (..., d): arrays, torch tensors, or rows of a model."""
@@ -214,7 +217,6 @@ class Encoder(BaseEncoder):
         return values, arrays
 
     def _on_device(self, device: Any) -> Arrays:
-        """This encoder's arrays as torch tensors on a device, made once."""
         if device not in self._on:
             import torch
 
@@ -254,3 +256,64 @@ def _imported(
     if made.can_decode:
         tried.decode(tried.encode(np.zeros((2, task.size))))
     return made
+
+
+def save(encoder: Encoder, path: Path) -> None:
+    """Write an encoder's file, whole or not at all."""
+    write_whole(path, _packed(encoder))
+
+
+def save_new(encoder: Encoder, path: Path) -> None:
+    """The same of a file that doesn't exist yet."""
+    make_folder(path.parent)
+    write_new(path, _packed(encoder))
+
+
+def _packed(encoder: Encoder) -> bytes:
+    return container.pack(encoder.tensors(), encoder.header.as_json())
+
+
+def load(path: Path) -> Encoder:
+    """Read an encoder's file."""
+    return unpack(path, *container.read(path, "encoder"))
+
+
+def unpack(path: Path, tensors: Tensors, header: dict[str, Any]) -> Encoder:
+    """The encoder with these tensors, which are used up, and this header, from that path."""
+    known = document_from(header, path, EncoderHeader)
+    try:
+        return _encoder(known, tensors)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _encoder(header: EncoderHeader, tensors: Tensors) -> Encoder:
+    if header.kind != IMPORTED and type(header.metrics.get(HELD_OUT_MSE)) is not float:
+        raise InputError(f"the header's metrics have no {HELD_OUT_MSE}, or not as a float")
+    encoder = _layers("encoder", header.encoder, tensors)
+    decoder = _layers("decoder", header.decoder, tensors)
+    made = Coordinates(header.environment, header.coordinates) if header.coordinates else None
+    scaler = Scaler(_take(tensors, "low"), _take(tensors, "high"), made, header.clip)
+    if tensors:
+        raise InputError(f"unexpected tensor {min(tensors)}")
+    return Encoder(header, scaler, encoder, decoder, header.keep)
+
+
+def _layers(part: str, activations: tuple[str, ...], tensors: Tensors) -> Layers:
+    return tuple(
+        _layer(f"{part}.{i}", activation, tensors) for i, activation in enumerate(activations)
+    )
+
+
+def _layer(name: str, activation: str, tensors: Tensors) -> "Layer | Model":
+    if activation != ONNX:
+        return Layer(_take(tensors, f"{name}.weight"), _take(tensors, f"{name}.bias"), activation)
+    from jbrep.encoders.imported import Model  # imports onnx
+
+    return Model(_take(tensors, f"{name}.{ONNX}").tobytes())
+
+
+def _take(tensors: Tensors, name: str) -> np.ndarray:
+    if name not in tensors:
+        raise InputError(f"tensor {name} is missing")
+    return tensors.pop(name)

@@ -28,14 +28,9 @@ _FLOATS = (TensorProto.FLOAT, TensorProto.DOUBLE)
 
 
 class Model:
-    """An ONNX model as a layer, from rows (..., in) to (..., units), run on the CPU.
+    """An ONNX model as a layer, from rows (..., inputs) to (..., units), run on the CPU.
 
-    Args:
-        content: of its file; one input (rows, in) and one output (rows, units), both of floats.
-
-    Attributes:
-        proto: the model.
-        inputs, units: numbers that it takes and gives.
+    Its file has one input (rows, inputs) and one output (rows, units), both of floats.
     """
 
     activation = ONNX

@@ -187,11 +187,8 @@ def traced(
 ) -> onnx.ModelProto:
     """The model of a computation in NumPy, checked.
 
-    Args:
-        name: of the graph.
-        size: numbers of an observation, the model's input.
-        outputs: what is computed of observations (rows, size): values with their names.
-        metadata: plain JSON, which the model has as its property jbrep.
+    `outputs` computes values with their names of observations (rows, size), the model's input. The
+    metadata, plain JSON, are its property jbrep.
     """
     graph, described = _Graph(), []
     for output, rows in outputs(_Rows(graph, "observation", size)):

@@ -13,10 +13,8 @@ from jbrep.coordinates.invariance import tried_coordinates
 from jbrep.dataset import Scaler
 from jbrep.dataset.scaling import usual_range
 from jbrep.encoders.base import BaseEncoder, as_encoder
-from jbrep.encoders.encoder import Encoder
-from jbrep.encoders.file import SUFFIX, load
-from jbrep.encoders.header import FULL, HELD_OUT_MSE, EncoderHeader
-from jbrep.encoders.names import EncoderName
+from jbrep.encoders.encoder import SUFFIX, Encoder, load
+from jbrep.encoders.header import FULL, HELD_OUT_MSE, EncoderHeader, EncoderName
 from jbrep.envs.names import code_named, is_code
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, refusing
@@ -199,7 +197,6 @@ def _is_made(name: str | Path, task: Task) -> bool:
 
 
 def _files(task: Task) -> dict[str, Path]:
-    """The files that ship for a task, by their names in order."""
     paths = shipped_folder(task).glob(f"*{SUFFIX}")
     files = {path.name.removesuffix(SUFFIX): path for path in paths}
     return dict(sorted(files.items(), key=lambda item: EncoderName.parse(item[0]).order))

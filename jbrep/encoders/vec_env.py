@@ -96,12 +96,10 @@ class JitterbugVecEnv(VecEnv):
         return self._represent(self._robots.restart())
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
-        """Keep the actions, (num_envs, k), for `step_wait`; they are clipped to [-1, 1]."""
         checked = check_actions(actions, self.num_envs, self.task.action_size)
         self._actions = self.task.unscale_action(checked)
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Hold the actions for a step of every lane; where an episode ends, start the next."""
         moved = self._robots.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if moved.ended.any():
@@ -131,24 +129,19 @@ class JitterbugVecEnv(VecEnv):
         return self._encoder.encode(observation.astype(np.float32))
 
     def close(self) -> None:
-        """Free what the environments hold."""
         self.lanes.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Get an attribute of this environment, which the lanes share."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of this environment, for all lanes."""
         setattr(self, attr_name, value)
 
     def env_method(
         self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
     ) -> list[Any]:
-        """Call a method of this environment once; the result is repeated for every lane."""
         result = getattr(self, method_name)(*args, **kwargs)
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """False: no lane is an environment of its own."""
         return [False for _ in self._get_indices(indices)]

@@ -157,7 +157,6 @@ class EncodedVectorEnv(Encoded, VectorWrapper[Float32, Any, Any, Any, Any]):
 
 
 def _described(env: Any) -> Task:
-    """The task of an environment, from its spec."""
     for each in _wrappers(env):
         changed = isinstance(each, _CHANGING) and not isinstance(each, _KEEPING)
         if changed or isinstance(each, Encoded):

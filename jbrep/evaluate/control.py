@@ -11,10 +11,17 @@ from scipy.signal import lfilter
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders.base import BaseEncoder
-from jbrep.evaluate.evaluation import Lost, Score, Scores, nearest_horizon
+from jbrep.evaluate.evaluation import (
+    Judged,
+    Lost,
+    Scalar,
+    Score,
+    Scores,
+    diagnostic,
+    nearest_horizon,
+)
 from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
 from jbrep.evaluate.prediction import Matters, following
-from jbrep.evaluate.registry import Judged, Scalar, diagnostic
 from jbrep.evaluate.regression import Networks, Problem, ridge
 from jbrep.stats.bootstrap import Array, by_episode
 
@@ -80,7 +87,6 @@ class States:
 
 
 def _known(episode: PlayedEpisode) -> int:
-    """Steps whose return to go is known."""
     steps = len(episode.reward)
     return steps if episode.terminated else max(0, steps - _UNKNOWN)
 

@@ -17,12 +17,19 @@ from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
 from jbrep.evaluate import control, readout
 from jbrep.evaluate.control import GoodPolicy, Needs, lost, needs
-from jbrep.evaluate.evaluation import EVALUATION, KEPT, Diagnostics, Evaluation, JudgedOn
+from jbrep.evaluate.evaluation import (
+    EVALUATION,
+    KEPT,
+    Diagnostics,
+    Evaluation,
+    Judged,
+    JudgedOn,
+    measured,
+)
+from jbrep.evaluate.evaluation import SCALARS as SCALARS
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.prediction import prediction, problems
 from jbrep.evaluate.reconstruction import reconstruction
-from jbrep.evaluate.registry import SCALARS as SCALARS
-from jbrep.evaluate.registry import Judged, measured
 from jbrep.evaluate.regression import Networks, beside, fit
 from jbrep.machine import cores
 from jbrep.progress import Progress

@@ -1,15 +1,30 @@
-"""What is known of encoders from held-out episodes: the file evaluation.json."""
+"""What is known of encoders from held-out episodes: evaluation.json, and the diagnostics in it.
+
+A diagnostic is a function of a judged encoder, registered with the columns that it fills.
+evaluation.json, diagnostics.csv, the tables on the screen and a study's report follow from what is
+registered, so that a further diagnostic is a further function, such as
+
+    @diagnostic(Scalar("farthest", "the largest mean of a unit", better=-1))
+    def farthest(e: Judged) -> Score:
+        return Score(max(map(abs, e.known.latent_units.mean)))
+"""
 
 import json
 import re
-from collections.abc import Iterable
-from typing import Any, ClassVar, Literal, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 from msgspec import UNSET, UnsetType
 
 from jbrep.records.document import Document
 from jbrep.records.record import Record
 from jbrep.stats.bootstrap import Interval
+
+if TYPE_CHECKING:
+    from jbrep.encoders.base import BaseEncoder
+    from jbrep.evaluate.control import GoodPolicy
+    from jbrep.evaluate.held_out import HeldOut
+    from jbrep.evaluate.regression import Networks
 
 EVALUATION = "evaluation.json"
 KEPT = "kept_features"  # in what a method says: how many pass around its layers
@@ -159,9 +174,60 @@ class Evaluation(Document, frozen=True, kw_only=True):
 
 
 def _rounded(value: Any) -> Any:
-    """Plain JSON with all numbers that have a point in six digits."""
     if isinstance(value, float):
         return float(f"{value:.{_DIGITS}g}")
     if isinstance(value, dict):
         return {name: _rounded(each) for name, each in value.items()}
     return [_rounded(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+class Judged(NamedTuple):
+    """An encoder on held-out episodes, with what all diagnostics of it share."""
+
+    encoder: "BaseEncoder"
+    held_out: "HeldOut"
+    policy: "GoodPolicy | None"  # that does the task well, if one is known
+    learnt: "Networks"  # regressions from the latent
+    known: Diagnostics  # prediction, probes, reconstruction and units; no scores yet
+
+
+class Scalar(NamedTuple):
+    """A named number of an encoder's diagnostics: a column of diagnostics.csv."""
+
+    name: str
+    words: str  # what it is, in a few words
+    better: int = 1  # 1 if higher is better, -1 if lower is
+    is_first: bool = False  # whether it is among the first that a user sees
+
+    def read(self, known: Diagnostics) -> Score | None:
+        """Its score, if an evaluation has it."""
+        return known.scores.get(self.name)
+
+
+SCALARS: dict[str, Scalar] = {}  # by name; complete where jbrep.evaluate.diagnosis is
+_REGISTERED: list[tuple[Callable[[Judged], Any], tuple[str, ...]]] = []
+_Measure = TypeVar("_Measure", bound=Callable[[Judged], Any])
+
+
+def diagnostic(*scalars: Scalar) -> Callable[[_Measure], _Measure]:
+    """Register a function that returns the score of a scalar; of several, a tuple of theirs.
+
+    A score is None where it isn't known.
+    """
+
+    def register(measure: _Measure) -> _Measure:
+        SCALARS.update({each.name: each for each in scalars})
+        _REGISTERED.append((measure, tuple(each.name for each in scalars)))
+        return measure
+
+    return register
+
+
+def measured(judged: Judged) -> Scores:
+    """The scores of an encoder, as far as they are known, in the order of registration."""
+    scores: Scores = {}
+    for measure, names in _REGISTERED:
+        found = measure(judged)
+        several = (found,) if len(names) == 1 else found
+        scores |= {name: s for name, s in zip(names, several, strict=True) if s is not None}
+    return scores

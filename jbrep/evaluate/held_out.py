@@ -107,8 +107,8 @@ def explained(
     """R^2 of each part of predicted columns (n, k); the columns of a part count together.
 
     Args:
-        predicted: the columns.
-        true: what they should be, (n, k).
+        predicted: columns (n, k).
+        true: what they should be.
         rows: their rows, (n,).
         summed: sums of arrays (n, k) over the rows of each episode, which are resampled.
         widths: of the parts; None for all columns as one part.

@@ -11,9 +11,8 @@ from jbrep.coordinates import wrapped
 from jbrep.dataset import Column, ScaledDataset
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
-from jbrep.evaluate.evaluation import Prediction, Score
+from jbrep.evaluate.evaluation import Judged, Prediction, Scalar, Score, diagnostic
 from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
-from jbrep.evaluate.registry import Judged, Scalar, diagnostic
 from jbrep.evaluate.regression import Predictor, Problem
 from jbrep.training.windows import first_rows
 

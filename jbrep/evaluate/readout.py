@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
-from jbrep.evaluate.evaluation import LatentUnits, Score, Scores
+from jbrep.evaluate.evaluation import Judged, LatentUnits, Scalar, Score, Scores, diagnostic
 from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
 from jbrep.evaluate.prediction import changes
-from jbrep.evaluate.registry import Judged, Scalar, diagnostic
 from jbrep.evaluate.regression import Predictor, Problem, ridge
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.stats.bootstrap import Array
@@ -112,7 +111,6 @@ def _jitterbug(f: Columns) -> Columns:
 
 
 def _on_circle(angle: Array) -> Array:
-    """Cosine and sine, (n, 2)."""
     return np.stack((np.cos(angle), np.sin(angle)), axis=1)
 
 

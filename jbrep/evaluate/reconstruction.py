@@ -9,11 +9,18 @@ from numpy.typing import NDArray
 from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.header import EncoderHeader
-from jbrep.evaluate.evaluation import FeatureError, Reconstruction, Score, score, scores
+from jbrep.evaluate.evaluation import (
+    FeatureError,
+    Judged,
+    Reconstruction,
+    Scalar,
+    Score,
+    diagnostic,
+    score,
+    scores,
+)
 from jbrep.evaluate.held_out import HeldOut
-from jbrep.evaluate.registry import Judged, Scalar, diagnostic
-from jbrep.methods.held_out import NOTHING, lost
-from jbrep.methods.linear import principal_code
+from jbrep.methods.linear import NOTHING, lost, principal_code
 from jbrep.stats.bootstrap import Array, bootstrap, r_squared, variation
 
 
@@ -53,7 +60,6 @@ def _means(sums: Array) -> Array:
 
 
 def _mean(total: Array, rows: Array) -> Array:
-    """Mean over rows, from the sums (..., 1) of a value of each row."""
     return (total / rows)[..., 0]
 
 

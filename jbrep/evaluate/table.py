@@ -43,9 +43,6 @@ def read_diagnostics(path: Path, sha256: str | None = None) -> list[Diagnosed]:
     Args:
         path: of its file.
         sha256: of the file, if it is known.
-
-    Raises:
-        DamageError: it is not such a table, or has another SHA-256.
     """
     return [Diagnosed(*row) for row in read_csv(path, _KEY, sha256, further=_value)]
 

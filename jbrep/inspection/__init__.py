@@ -1,4 +1,4 @@
-"""Episodes, encoders and training curves as Rerun recordings; nothing here opens a viewer."""
+"""Episodes and encoders as Rerun recordings; nothing here opens a viewer."""
 
 from jbrep.inspection.subject import inspect
 

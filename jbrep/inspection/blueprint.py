@@ -2,10 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import rerun as rr
 import rerun.blueprint as rrb
 
 from jbrep.encoders.base import BaseEncoder
@@ -17,7 +16,6 @@ from jbrep.inspection.signals import PATH, STEP, TIME, numbered_panels, panels
 from jbrep.play.jitterbug import jitterbug_task
 
 TRAVERSE = "traverse"  # a timeline, and the parent entity of its series
-TRAINING_STEP = "training_step"
 _BACKGROUND = (38, 42, 50)
 _TAIL = 0.3  # [s] of the latent's path that are drawn as a line
 _NEAR = 1.0  # [s] shown before and after the current time: plots of signals at motor frequency
@@ -84,29 +82,10 @@ def traversal_layout(units: int, robot: Robot | None, places: Array) -> rrb.Blue
     return _blueprint(rrb.Vertical(view, below), TRAVERSE)
 
 
-def curves_layout(groups: Sequence[str], last_step: int) -> rrb.Blueprint:
-    """A plot for each task and algorithm."""
-    training = rrb.TimeAxis(
-        view_range=rr.TimeRange(
-            start=rrb.TimeRangeBoundary.absolute(seq=0),
-            end=rrb.TimeRangeBoundary.absolute(seq=last_step),
-        )
-    )
-    plots = [_series(f"{group}: mean return", [f"{group}/**"], axis_x=training) for group in groups]
-    text = rrb.TextDocumentView(origin=PROVENANCE, name="runs")
-    layout = rrb.Horizontal(rrb.Grid(*plots), text, column_shares=[2, 1])
-    return _blueprint(layout, TRAINING_STEP, "paused")
-
-
-def _blueprint(
-    layout: rrb.Container | rrb.View,
-    timeline: str,
-    play_state: Literal["playing", "paused"] = "playing",
-) -> rrb.Blueprint:
-    """Plays from the start, again and again, if not told otherwise."""
+def _blueprint(layout: rrb.Container | rrb.View, timeline: str) -> rrb.Blueprint:
     return rrb.Blueprint(
         layout,
-        rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play_state, loop_mode="all"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="playing", loop_mode="all"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
@@ -122,7 +101,6 @@ def _world(name: str, robot: Robot, **settings: Any) -> rrb.Spatial3DView:
 
 
 def _path(task: Task) -> rrb.Spatial2DView:
-    """The latent's first two principal components."""
     tail = f"{_TAIL} s" if task.timestep else f"{round(_TAIL / _USUAL_TIMESTEP)} steps"
     return rrb.Spatial2DView(
         origin="latent",
@@ -159,7 +137,6 @@ def _features(
 
 
 def _pages(name: str, plots: Sequence[rrb.View]) -> list[rrb.Grid]:
-    """Plots on as many pages as they need, in two columns."""
     count = -(-len(plots) // _MOST_PLOTS)
     parts = [plots[len(plots) * i // count : len(plots) * (i + 1) // count] for i in range(count)]
     return [

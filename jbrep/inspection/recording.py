@@ -37,12 +37,9 @@ def pieces(path: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 class Recording:
-    """A recording in memory, until it is written.
+    """A recording in memory, until it is written, with a title and Markdown beside it.
 
-    Args:
-        name: its title in the viewer.
-        about: Markdown, shown beside it.
-        numbers: hashed with the text into the recording's id: the same content has the same id.
+    Its id is a hash of that text and of numbers: the same content has the same id.
     """
 
     def __init__(self, name: str, about: str, *numbers: NDArray[Any]):
@@ -93,16 +90,7 @@ class Recording:
         colours: Sequence[Colour] | None = None,
         width: float = 2.0,
     ) -> None:
-        """Send the lines of one plot.
-
-        Args:
-            path: of the entity.
-            times: of the rows.
-            values: (rows, lines).
-            names: of the lines, with their units.
-            colours: of the lines; those of `palette` if not given.
-            width: of the lines [points].
-        """
+        """Send the lines (rows, lines) of a plot, whose names have units; width is in points."""
         lines = len(names)
         style = rr.SeriesLines(
             names=names, colors=colours or palette(lines), widths=[width] * lines

@@ -127,15 +127,10 @@ class Robot:
         bodies: Iterable[int],
         colours: NDArray[np.uint8] | None = None,
     ) -> None:
-        """Draw bodies as entities below another; what doesn't move in its frame is sent once.
+        """Draw bodies as entities below `root`; what doesn't move in its frame is sent once.
 
-        Args:
-            recording: to draw in.
-            root: the entity.
-            times: of the states.
-            poses: of all bodies in n states.
-            bodies: numbers of those to draw.
-            colours: of each of them in each state, (n, len(bodies), 4); their own if not given.
+        Poses are of all bodies in n states; colours of each drawn one in each state, (n,
+        len(bodies), 4), or their own.
         """
         for i, body in enumerate(bodies):
             geoms, columns = self.geoms(body), []
@@ -180,10 +175,7 @@ def shapes(
 ) -> list[Any]:
     """Geoms of one body in its frame, as an archetype for each of their kinds.
 
-    Args:
-        model: the model.
-        geoms: their numbers, as of `Robot.geoms`.
-        colours: of each geom, (len(geoms), 4); none if not given.
+    With a colour for each, (len(geoms), 4), or with none.
     """
     kinds: dict[Any, list[int]] = defaultdict(list)
     for i, geom in enumerate(geoms):
@@ -200,7 +192,6 @@ def shapes(
 
 
 def _fields(model: mujoco.MjModel, kind: Any, geoms: list[int]) -> dict[str, Any]:
-    """Sizes and poses of geoms of one kind."""
     size, centre = model.geom_size[geoms], model.geom_pos[geoms]
     turned = {"quaternions": model.geom_quat[geoms][:, XYZW]}
     if kind is rr.Cylinders3D:
@@ -214,7 +205,6 @@ def _fields(model: mujoco.MjModel, kind: Any, geoms: list[int]) -> dict[str, Any
 
 
 def _matrices(model: mujoco.MjModel, geoms: Sequence[int]) -> Array:
-    """Rotations of geoms in their bodies' frames, (len(geoms), 3, 3)."""
     matrices = np.empty((len(geoms), 9))
     for row, geom in zip(matrices, geoms, strict=True):
         mujoco.mju_quat2Mat(row, model.geom_quat[geom])

@@ -151,15 +151,9 @@ def send_ghost(
     motion: Motion,
     decoded: Array,
 ) -> None:
-    """Send the decoded robot, whose colours show how far each body is from its true place.
+    """Send the robot of decoded observations (n, d) in physical units.
 
-    Args:
-        recording: to draw in.
-        robot: the Jitterbug.
-        times: of the states.
-        task: one of the Jitterbug's.
-        motion: what the robot really went through, n states.
-        decoded: observations (n, d) in physical units.
+    Its colours show how far each body is from its true place in that motion of n states.
     """
     qpos = as_qpos(task, decoded)
     ghost, true = robot.poses(Motion(robot.model, {"qpos": qpos})), robot.poses(motion)
@@ -174,7 +168,6 @@ def send_ghost(
 def _send_goal(
     recording: Recording, times: Sequence[rr.TimeColumn], task: Task, decoded: Array, qpos: Array
 ) -> None:
-    """Send the decoded target, if the task observes it."""
     parts = task.split(decoded)
     origin, turned = qpos[:, POSITION], qpos[:, QUATERNION]
     if "target" in parts:

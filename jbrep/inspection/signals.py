@@ -128,7 +128,6 @@ def principal_components(latent: Array) -> Array:
 
 
 def _send_path(recording: Recording, times: Sequence[rr.TimeColumn], latent: Array) -> None:
-    """Send all latents as points, lines between successive ones, and the current one."""
     path = principal_components(latent)
     recording.send(f"{PATH}/all", rr.Points2D(path, colors=[_ALL_COLOUR], radii=[_ALL_RADIUS]))
     recording.send_moving(PATH, times, rr.LineStrips2D, SKY, _PATH_RADIUS, strips=pieces(path))

@@ -1,9 +1,8 @@
-"""Recordings of whatever a user names: an episode, an encoder or a study."""
+"""Recordings of what a user names: an episode with its reconstruction, or a latent's units."""
 
 import re
-from collections import defaultdict
-from collections.abc import Callable, Sequence
-from functools import reduce
+from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -11,29 +10,35 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from jbrep.coordinates.nearest import continuous
+from jbrep.coordinates.placing import placed
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.encoders import FULL, find
+from jbrep.encoders import find
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
+from jbrep.encoders.encoder import SUFFIX as ENCODER_SUFFIX
 from jbrep.encoders.shipped import find_alone, source_of
-from jbrep.envs.task import Task
+from jbrep.envs.physics import Motion
+from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
-from jbrep.inspection.blueprint import TRAINING_STEP, curves_layout
-from jbrep.inspection.episode import record_episode, record_traversal
-from jbrep.inspection.recording import SUFFIX, Recording, check_out, palette
+from jbrep.inspection.blueprint import TRAVERSE, episode_layout, traversal_layout
+from jbrep.inspection.recording import GREY, SUFFIX, Recording, check_out
+from jbrep.inspection.robot import Robot
+from jbrep.inspection.scene import WORLD, as_qpos, send_floor, send_ghost, send_scene
+from jbrep.inspection.signals import scaled_titles, send_encoding, send_signals, times_at
+from jbrep.jitterbug.tasks import POSITION
+from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode, is_trained, run_folder
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, check_begun, is_run
-from jbrep.stats import RunCurve
-from jbrep.stats.bootstrap import Array
-from jbrep.stats.runs import in_order, with_failure_returns
-from jbrep.study.results import has_runs, read_runs
 
 FOLDER = Path("inspect")  # of recordings without an --out
 _POLICY = "uniform"  # plays the episode that an encoder alone is shown on
-_RUN_WIDTH = 1.0  # [points]
-_MEDIAN_WIDTH = 4.0  # [points]
+POINTS = 101
+SPACING = 0.12  # [m] between the robots
+_ENDS = (1, 99)  # [%] of the episode's latents
+_LABEL_HEIGHT = 0.1  # [m]
+_MOST = 3  # features that the summary lists for a unit
 
 
 def inspect(
@@ -45,12 +50,12 @@ def inspect(
     out: Path | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> Path:
-    """Write the Rerun recording of an episode, of a latent's units, or of a study's curves.
+    """Write the Rerun recording of an episode, or of a latent's units.
 
     Args:
-        source: a data set's folder, a run's, or one with several runs below; an encoder's file, or
-            a policy's name; an encoder alone is shown on an episode under uniformly random actions.
-            A run that is not over plays its last checkpoint.
+        source: a data set's folder, or a run's; an encoder's file, or a policy's name; an encoder
+            alone is shown on an episode under uniformly random actions. A run that is not over
+            plays its last checkpoint.
         episode: its number, from 0; the first if not given.
         task: of a policy or encoder by its name; a run plays it instead of its own.
         encoder: a file, the name of one that ships, code, or an object that encodes, as
@@ -64,15 +69,6 @@ def inspect(
     """
     if out:
         check_out(out)
-    if source and _is_other_folder(Path(source)) and has_runs(Path(source)):
-        if encoder is not None or traverse or task or episode is not None:
-            raise InputError(
-                f"{source} holds several runs, whose training curves are shown without --episode, "
-                "--task, --encoder and --traverse: give one run's folder to see an episode"
-            )
-        out = out or _default(source, "curves")
-        record_curves(read_runs(Path(source)), source, out)
-        return out
     rollout, shown = _find(source, episode or 0, task, encoder)
     if isinstance(encoder, (str, Path)):
         tell(f"encoder: {source_of(encoder, rollout.task)}")
@@ -99,7 +95,6 @@ def _is_other_folder(path: Path) -> bool:
 def _find(
     source: str | None, episode: int, task: Task | None, encoder: Any
 ) -> tuple[Rollout, BaseEncoder | None]:
-    """The episode, and the encoder to show with it."""
     if source is None or (source.endswith(ENCODER_SUFFIX) and not is_trained(source)):
         if (source is None) == (encoder is None):
             raise InputError("give a SOURCE to inspect, or one encoder with its --task")
@@ -109,8 +104,8 @@ def _find(
     if _is_other_folder(Path(source)):
         check_begun(Path(source))
         raise InputError(
-            f"{source} is no data set, no run with a policy or checkpoint, and holds no finished "
-            "run: jbrep collect makes a data set, jbrep rl a run"
+            f"{source} is no data set, and no run with a policy or checkpoint: give the folder of "
+            "one; jbrep report shows the curves of several runs"
         )
     rollout = find_episode(source, episode, task, _acting(run_folder(source), encoder))
     return rollout, rollout.encoder if encoder is None else find(encoder, rollout.task)
@@ -130,42 +125,114 @@ def _default(source: str | None, first: str, *more: str) -> Path:
     return FOLDER / f"{'-'.join(words)}{SUFFIX}"
 
 
-def median_curve(runs: Sequence[RunCurve]) -> tuple[NDArray[np.int64], Array]:
-    """Median over runs at the steps at which all were evaluated.
+def record_episode(rollout: Rollout, path: Path, encoder: BaseEncoder | None = None) -> None:
+    """Write an episode's recording, with an encoder's latent, and what it decodes if it does."""
+    task, motion = rollout.task, rollout.motion
+    content = [rollout.observation, rollout.action, rollout.reward]
+    if motion:
+        content.append(motion.qpos)
+    recording = Recording(rollout.name, provenance(rollout, encoder), *content)
+    times = times_at(task, np.arange(len(rollout) + 1))
+    robot = Robot(motion.model) if motion else None
+    send_signals(recording, rollout)
+    if robot and motion:
+        send_scene(recording, robot, times, motion)
+    if encoder:
+        latent, decoded = encoder.encode(rollout.observation), None
+        if encoder.can_decode:
+            back = encoder.decode(latent).astype(np.float64)
+            decoded = placed(task, back, rollout.observation) if encoder.not_decoded else back
+        send_encoding(recording, times, rollout, encoder, latent, decoded)
+        if decoded is not None and robot and motion and jitterbug_task(task):
+            send_ghost(recording, robot, times, task, motion, decoded)
+    recording.write(path, episode_layout(task, robot, encoder))
 
-    A failed run counts as its failure_return from the step at which it failed.
+
+def provenance(rollout: Rollout, encoder: BaseEncoder | None) -> str:
+    """The origin of an episode and its encoder as Markdown."""
+    facts = {"task": rollout.task.name}
+    if rollout.task.arguments:
+        facts["arguments"] = f"`{', '.join(rollout.task.given_arguments)}`"
+    if rollout.task.domain:
+        facts["domain"] = f"`{rollout.task.domain}`"
+    if rollout.seed >= 0:  # or else it isn't known
+        facts["seed"] = f"{rollout.seed}"
+    facts["steps"] = f"{len(rollout):,}"
+    if np.isfinite(rollout.reward).all():
+        facts["return"] = f"{rollout.episode_return:.1f}"
+    facts["end"] = "terminated" if rollout.terminated else "truncated"
+    if rollout.note:
+        facts["note"] = rollout.note
+    if encoder:
+        facts |= {
+            "encoder": f"{encoder.name} ({encoder.kind})",
+            "sizes": f"{encoder.size} features, {encoder.latent_size} units",
+            "SHA-256": f"`{encoder.fingerprint}`",
+        }
+    facts |= {package: version(package) for package in ("jbrep", "mujoco")}
+    lines = (f"- {name}: {fact}" for name, fact in facts.items())
+    return "\n".join([f"# {rollout.name}", "", *lines])
+
+
+def sweep(latent: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Latents (l, 101, l) that vary one unit at a time, with the others at their medians.
+
+    The range of each unit is that of the latents (n, l), from their 1st to their 99th percentile.
     """
-    whole = [run.steps for run in runs if run.failed_at is None] or [runs[0].curve()[0]]
-    steps: NDArray[np.int64] = reduce(np.intersect1d, whole)
-    each = [np.interp(steps, *run.curve()) for run in runs]
-    return steps, np.median(each, axis=0)
+    low, high = np.percentile(latent, _ENDS, axis=0)
+    units = latent.shape[1]
+    swept = np.tile(np.median(latent, axis=0), (units, POINTS, 1))
+    swept[range(units), :, range(units)] = np.linspace(low, high, POINTS, axis=1)
+    return swept.astype(np.float32)
 
 
-def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
-    """Write the training curves of runs in a folder, with a colour for each representation."""
-    labels = defaultdict(list)
-    for run in sorted(with_failure_returns(runs), key=lambda run: (run.label, run.seed)):
-        labels[run.label].append(run)
-    representations = in_order((run.representation for run in runs), FULL)
-    colours = dict(zip(representations, palette(len(representations)), strict=True))
-    numbers = [number for run in runs for number in (run.steps, run.returns)]
-    recording = Recording(source, _about(source, labels), *numbers)
-    for label, group in labels.items():
-        name = group[0].representation
-        curves = {f"seed-{run.seed}": (run.curve(), _RUN_WIDTH) for run in group}
-        curves["median"] = median_curve(group), _MEDIAN_WIDTH
-        for curve, ((steps, returns), width) in curves.items():
-            times = [rr.TimeColumn(TRAINING_STEP, sequence=steps)]
-            look = [name], [colours[name]], width
-            recording.send_series(f"{label}/{curve}", times, returns[:, None], *look)
-    groups = sorted({f"{run.task}/{run.algorithm}" for run in runs})
-    recording.write(path, curves_layout(groups, max(int(run.curve()[0][-1]) for run in runs)))
+def record_traversal(rollout: Rollout, path: Path, encoder: BaseEncoder) -> None:
+    """Write a recording of what is decoded while one unit after the other varies.
+
+    The episode's latents give the range of each unit; of a Jitterbug there is a robot for each.
+    """
+    encoder.check_decodes("--traverse shows what each unit is decoded to")
+    task, swept = rollout.task, sweep(encoder.encode(rollout.observation))
+    name = f"{encoder.name} on {rollout.name}: each unit of the latent"
+    recording = Recording(name, provenance(rollout, encoder), swept)
+    times = [rr.TimeColumn(TRAVERSE, sequence=np.arange(POINTS))]
+    robot, titles, places = None, scaled_titles(task), np.zeros((len(swept), 3))
+    places[:, 0] = SPACING * (np.arange(len(swept)) - (len(swept) - 1) / 2)  # in a row
+    if rollout.motion and jitterbug_task(task):
+        robot = Robot(rollout.motion.model)
+        recording.send(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        send_floor(recording, robot, places)
+    summary = ["| unit | from | to | moves most |", "|---|---|---|---|"]
+    for unit, (latent, place) in enumerate(zip(swept, places, strict=True)):
+        decoded, below = encoder.decode(latent).astype(np.float64), f"{TRAVERSE}/unit_{unit}"
+        if robot:
+            _send_robot(recording, robot, times, as_qpos(task, decoded), unit, place)
+        smooth = continuous(task, decoded)
+        scaled = encoder.scale(smooth)
+        most = np.argsort(-np.ptp(scaled, axis=0))[:_MOST]
+        recording.send_series(f"{below}/decoded", times, scaled, titles)
+        recording.send_series(f"{below}/most", times, scaled[:, most], [titles[i] for i in most])
+        ends = f"{latent[0, unit]:.2f} | {latent[-1, unit]:.2f}"
+        spans = [(task.features[i], np.ptp(smooth[:, i])) for i in most]
+        told = ", ".join(f"{f.name} {span:.3g} {f.unit}".removesuffix(" 1") for f, span in spans)
+        summary.append(f"| {unit} | {ends} | {told} |")
+    recording.send_text(f"{TRAVERSE}/summary", "\n".join(summary))
+    recording.write(path, traversal_layout(len(swept), robot, places))
 
 
-def _about(source: str, labels: dict[str, list[RunCurve]]) -> str:
-    """The runs and their final returns, as Markdown."""
-    lines = [f"# {source}", "", "| runs | seeds | median return at the end |", "|---|---|---|"]
-    for label, runs in labels.items():
-        last = np.median([run.curve()[1][-1] for run in runs])
-        lines.append(f"| {label} | {len(runs)} | {last:.0f} |")
-    return "\n".join(lines)
+def _send_robot(
+    recording: Recording,
+    robot: Robot,
+    times: list[rr.TimeColumn],
+    qpos: Array,
+    unit: int,
+    place: Array,
+) -> None:
+    """Send a unit's robot and label; decoded x and y are left out, to keep it in the row."""
+    here, path = qpos.copy(), f"{WORLD}/unit_{unit}"
+    here[:, POSITION.start : POSITION.start + 2] = place[:2]
+    poses = robot.poses(Motion(robot.model, {"qpos": here}))
+    robot.draw(recording, path, times, poses, robot.bodies)
+    above, text = [(*place[:2], _LABEL_HEIGHT)], [f"unit {unit}"]
+    label = rr.Points3D(above, labels=text, colors=[GREY], radii=[0.0], show_labels=True)
+    recording.send(f"{path}/label", label)

@@ -61,7 +61,6 @@ class DdaeObjective(Objective):
 
     @property
     def _matrices(self) -> list[Tensor]:
-        """The weights without the biases."""
         return [parameter for parameter in self.parameters() if parameter.ndim > 1]
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,32 +5,35 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.coordinates import OBSERVATION
 from jbrep.coordinates.invariance import tried_coordinates
 from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.dataset.scaled import Moments
 from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import Encoder, load, save
-from jbrep.encoders.file import SUFFIX
-from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader
-from jbrep.encoders.names import check_name
+from jbrep.encoders.encoder import SUFFIX
+from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader, check_name
+from jbrep.encoders.layers import Layer, dense, run
+from jbrep.envs.task import Array
 from jbrep.errors import InputError, differences
-from jbrep.methods.held_out import held_out_error, ratio_to_pca
-from jbrep.methods.linear import PCA
+from jbrep.methods.linear import DEVIATION, PCA, held_out_error, inverse_root, ratio_to_pca
 from jbrep.methods.registry import METHODS, get_method, name_of
-from jbrep.methods.shape import complete
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, make_folder
-from jbrep.training import checkpoint
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method, Reconstructing
+from jbrep.training.objective import Layers
 from jbrep.training.trainer import Epoch, Trainer, default_batch_size, get_device, single_thread
 from jbrep.training.windows import Windows, count_windows, watched_windows
 
 _ALIKE = 0.05  # of PCA's error, within which another is as good
+_NEGLIGIBLE = 1e-12  # variance of a unit that says nothing
 _POOR = 1.5  # times PCA's error, from which a trained autoencoder deserves a warning
 
 
@@ -128,7 +131,6 @@ class Fitter:
         return plan
 
     def _scaled_data(self, method: Method) -> ScaledDataset:
-        """The data as a method sees them."""
         key = method.scaling, method.on, method.leave_out, method.clip, method.keep
         if key not in self._scaled:
             usual = (EXTREMA, OBSERVATION, (), None, ())
@@ -173,13 +175,13 @@ class Fitter:
         identity = {**_origin(header), **versions}
         saved = work / "checkpoint.safetensors"
         if exists(saved):
-            checkpoint.restore(trainer, identity, saved)
+            trainer.restore(identity, saved)
         try:
             with SummaryWriter(str(work), purge_step=len(trainer.history) + 1) as scalars:
                 for _ in _with_progress(trainer, header.name):
                     for name, value in trainer.history[-1]._asdict().items():
                         scalars.add_scalar(name, value, len(trainer.history))
-                    checkpoint.save(trainer, identity, saved)
+                    trainer.save(identity, saved)
         finally:
             if trainer.history:
                 self._save_best(plan, trainer, watched)
@@ -210,14 +212,13 @@ class Fitter:
     def _save(self, plan: Plan, made: Made) -> None:
         """Write the file, with the error on all held-out rows among its metrics."""
         method, data = plan.method, plan.data
-        parts, keep = complete(made, data, method.codes, method.keep)
-        encoder = Encoder(plan.header, data.scaler, *parts, keep)
+        parts = complete(made, data, method.codes, method.keep)
+        encoder = Encoder(plan.header, data.scaler, *parts)
         metrics = {**made.metrics, HELD_OUT_MSE: held_out_error(encoder, self._data)}
         save(encoder.with_header(metrics=metrics), plan.path)
 
 
 def _header(method: Method, name: str, data: ScaledDataset) -> EncoderHeader:
-    """The header of an encoder, without its metrics."""
     manifest = data.dataset.manifest
     return EncoderHeader(
         kind=method.name,
@@ -243,7 +244,6 @@ def _origin(header: EncoderHeader) -> dict[str, Any]:
 
 
 def _with_progress(trainer: Trainer, name: str) -> Iterator[Epoch]:
-    """The epochs still to train, with a progress bar."""
     total, done = trainer.schedule.epochs, len(trainer.history)
     with Progress(total=total, initial=done, desc=name, unit="epoch") as progress:
         for epoch in trainer.epochs():
@@ -272,4 +272,92 @@ def purpose(encoder: Encoder, data: ScaledDataset) -> str:
     return (
         f"{told}; train for more --epochs, on more data, or with another --learning-rate or "
         "--batch-size"
+    )
+
+
+def complete(
+    made: Made, data: ScaledDataset, codes: str = "raw", keep: tuple[str, ...] = ()
+) -> tuple[Layers, Layers, tuple[str, ...]]:
+    """An encoder's layers, its decoder's, and the features that pass around them.
+
+    What a method made gets the scale of its code and, if it has none, a linear decoder. `keep`
+    names what passes around the layers, unless the method says which.
+    """
+    encoder, decoder = made.encoder, made.decoder
+    if not encoder:
+        return encoder, (), ()
+    if codes != "raw" or decoder is None:
+        moments, shared = _code_moments(encoder, data)
+        if decoder is None:
+            decoder = (_best_decoder(moments, shared, data),)
+        if codes != "raw":
+            encoder, decoder = _rescaled(encoder, decoder, moments, codes)
+    if data.size < data.scaler.size:
+        encoder, decoder = _widened(encoder, decoder, data)
+    every = data.scaler.features(data.task)
+    kept = tuple(every[i].name for i in data.scaler.places(keep, data.task))
+    return encoder, decoder, made.keep or kept
+
+
+def _code_moments(layers: Layers, data: ScaledDataset) -> tuple[Moments, Array]:
+    """Moments of the code over the training rows, and its covariance with the rows, (l, size)."""
+    size = len(layers[-1].bias)
+    total, products = np.zeros(size), np.zeros((size, size + data.size))
+    for rows in data.chunks(data.train):
+        code = run(layers, rows).astype(np.float64)
+        total += code.sum(axis=0)
+        products += code.T @ np.hstack((code, rows))
+    count = len(data.train)
+    mean = total / count
+    covariance = products / count - np.outer(mean, np.concatenate((mean, data.moments.mean)))
+    return Moments(mean, covariance[:, :size]), covariance[:, size:]
+
+
+def _best_decoder(moments: Moments, shared: Array, data: ScaledDataset) -> Layer:
+    """The linear map from the code to the row with the least squared error."""
+    weight = shared.T @ np.linalg.pinv(moments.covariance, hermitian=True)
+    return dense(weight, data.moments.mean - weight @ moments.mean)
+
+
+def _rescaled(
+    encoder: Layers, decoder: Layers, moments: Moments, codes: str
+) -> tuple[Layers, Layers]:
+    """The same code with standard deviation 1/3 in each unit, uncorrelated if it is to be white."""
+    mean, covariance = moments
+    if codes == "white":
+        scale = DEVIATION * inverse_root(covariance, "the code")
+    else:
+        variance = np.diag(covariance)
+        varies = variance > _NEGLIGIBLE
+        scale = np.diag(np.where(varies, DEVIATION / np.sqrt(np.where(varies, variance, 1)), 1))
+    return _after(encoder, scale, -scale @ mean), _before(decoder, np.linalg.inv(scale), mean)
+
+
+def _after(layers: Layers, weight: Array, bias: Array) -> Layers:
+    last = layers[-1]
+    if last.activation != "linear":
+        return (*layers, dense(weight, bias))
+    return (*layers[:-1], dense(weight @ last.weight, weight @ last.bias + bias))
+
+
+def _before(layers: Layers, weight: NDArray[Any], bias: Array) -> Layers:
+    first = layers[0]
+    both = dense(first.weight @ weight, first.weight @ bias + first.bias, first.activation)
+    return (both, *layers[1:])
+
+
+def _widened(encoder: Layers, decoder: Layers, data: ScaledDataset) -> tuple[Layers, Layers]:
+    """Layers that take and give all scaled numbers, not only those that are used.
+
+    The others count nothing in the encoder, and come out as 0.
+    """
+    size, used = data.scaler.size, data.used
+    first, last = encoder[0], decoder[-1]
+    takes = np.zeros((len(first.bias), size), np.float32)
+    takes[:, used] = first.weight
+    gives, bias = np.zeros((size, last.weight.shape[1]), np.float32), np.zeros(size, np.float32)
+    gives[used], bias[used] = last.weight, last.bias
+    return (
+        (first._replace(weight=takes), *encoder[1:]),
+        (*decoder[:-1], last._replace(weight=gives, bias=bias)),
     )

@@ -20,19 +20,12 @@ Lags = Annotated[Steps, Meta(description="Steps from now to later, one or severa
 class Lagged:
     """Second moments of what is now and the rows some steps later, at several lags, in one pass.
 
-    They are over all windows as long as the longest lag.
-
-    Args:
-        data: scaled.
-        lags: steps from now to later.
-        width: of what is now, n.
-        now: what is now, of a block of windows, (m, n).
+    They are over all windows as long as the longest lag; `now` makes what is now, (m, n) with n =
+    `width`, of a block of windows.
 
     Attributes:
-        now_mean: (n,).
-        now: E[x x'] of what is now, (n, n).
-        later_mean: of the rows at each lag, (lags, size).
-        later: E[y y'] of the rows at each lag, (lags, size, size).
+        now_mean, now: (n,) and E[x x'], (n, n).
+        later_mean, later: of the rows at each lag, (lags, size) and E[y y'], (lags, size, size).
         across: E[x y'], (lags, n, size).
     """
 

@@ -1,11 +1,19 @@
-"""Linear codes: principal components, and what every method that finds directions needs."""
+"""Linear codes: principal components, and what every method that finds directions needs.
 
+Principal components are also what other encoders' reconstructions are compared with.
+"""
+
+from collections.abc import Container
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
+from jbrep.encoders import Encoder
+from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.header import EncoderHeader
 from jbrep.encoders.layers import dense
 from jbrep.envs.task import Array
 from jbrep.errors import InputError
@@ -13,6 +21,7 @@ from jbrep.training.method import ClosedForm, Coded, Made
 from jbrep.training.objective import Layers
 
 DEVIATION = 1 / 3  # of a unit of a scaled code, so that most of its values lie in [-1, 1]
+NOTHING = 1e-10  # mean squared error of features scaled to [-1, 1]: rounding
 _NEGLIGIBLE = 1e-9  # variance, as a share of the largest
 _TINY = 1e-300  # variance of what is constant, to divide by
 _NAMED = 0.1  # part in a linear dependence from which a feature is named, beside the largest
@@ -108,3 +117,48 @@ class Directions(Coded, ClosedForm, frozen=True, kw_only=True):
                 f"encoder, with --keep {constant[0]}"
             )
         super().check_data(data)
+
+
+def held_out_error(
+    encoder: Encoder, data: ScaledDataset, not_decoded: Container[str] = ()
+) -> float:
+    """Mean squared error of the reconstruction over all held-out rows, scaled to [-1, 1].
+
+    Features that are `not_decoded` count as 0. Rounded to six digits: the others depend on the
+    number of threads.
+    """
+    decoded = [name not in not_decoded for name in data.task.feature_names]
+    total = 0.0
+    for rows in data.observations(data.test):
+        error = lost(encoder, rows, data)[:, decoded]
+        total += float(np.square(error, dtype=np.float64).sum())
+    return float(f"{total / (len(data.test) * data.task.size):.6g}")
+
+
+def lost(
+    encoder: BaseEncoder, rows: NDArray[np.float32], data: ScaledDataset
+) -> NDArray[np.float32]:
+    """What a reconstruction of rows (n, d) lacks, in half widths of the features in the data.
+
+    An encoder on coordinates is judged by what these tell of the rows: angles round the circle,
+    quaternions of either sign, and a robot that symmetry puts at the origin as it stands there.
+    """
+    back = encoder.decode(encoder.encode(rows))
+    if isinstance(encoder, Encoder) and (coordinates := encoder.scaler.coordinates):
+        rows = coordinates.inverse(coordinates.forward(rows))
+    return (encoder.comparable(back, rows) - rows) / data.scaler.half_width
+
+
+def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
+    """An encoder's held-out error as a multiple of PCA's, with as many components.
+
+    Both are of what the encoder tells at all: symmetry leaves out where the robot is. None where
+    PCA loses nothing.
+    """
+    if encoder.latent_size >= data.task.size:
+        return None
+    layers = principal_code(data, encoder.latent_size)
+    header = EncoderHeader(kind="pca", name="pca", environment=data.task)
+    pca = Encoder(header, data.scaler, *layers)
+    ours, theirs = (held_out_error(each, data, encoder.not_decoded) for each in (encoder, pca))
+    return ours / theirs if theirs > NOTHING else None

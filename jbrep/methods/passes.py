@@ -63,13 +63,9 @@ class Block:
 def blocks(data: ScaledDataset, horizon: int, width: int, work: int) -> Iterator[Block]:
     """All windows of the training part, in order; of very wide ones, evenly spaced blocks.
 
-    Memory doesn't grow with the number of rows, but for the places of the windows.
-
-    Args:
-        data: scaled.
-        horizon: rows of a window after its first.
-        width: numbers that the caller makes of each window, by which blocks are sized.
-        work: products that the caller makes of each window; blocks of 10^12 are given at most.
+    Memory doesn't grow with the number of rows, but for the places of the windows. `width` and
+    `work` are the numbers and the products that the caller makes of each window: by the first
+    blocks are sized, and so many are given that the second come to 10^12 at most.
     """
     if work > _WIDEST:
         raise InputError(

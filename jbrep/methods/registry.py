@@ -8,7 +8,7 @@ from msgspec.structs import asdict
 
 from jbrep.coordinates import System
 from jbrep.dataset.scaling import SCALINGS
-from jbrep.encoders.names import EncoderName, of_seed
+from jbrep.encoders.header import EncoderName, of_seed
 from jbrep.errors import InputError, choose
 from jbrep.methods.kinds import KINDS
 from jbrep.training.method import Method

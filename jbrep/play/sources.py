@@ -16,13 +16,12 @@ from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.player import Player
 from jbrep.play.rollout import Rollout, replay
 from jbrep.records.storage import exists
-from jbrep.rl import shipped
 from jbrep.rl.files import POLICY, POLICY_ZIP, check_begun, is_policy_file, is_run
-from jbrep.rl.shipped import SHIPPED
+from jbrep.rl.policy_file import SHIPPED, find_shipped
 
 if TYPE_CHECKING:
     from jbrep.evaluate.control import GoodPolicy
-    from jbrep.rl.trained import Trained
+    from jbrep.rl.policy import Trained
 
 _HEURISTIC = "heuristic"  # the Jitterbug's hand-written policy
 _GOOD_EPISODES = 30  # of a good policy
@@ -71,7 +70,7 @@ def find_policy(text: str, folder: Path, task: Task) -> Policy:
         by_name = part.partition(":")[0] in POLICIES
         if not is_trained(part) and (by_name or not any(folder.glob("policy-*.safetensors"))):
             return None
-        from jbrep.rl.frozen import freeze, kept  # imports torch
+        from jbrep.rl.policy import freeze, kept  # imports torch
 
         file, run = f"policy-{len(taken)}.safetensors", run_folder(part)
         source = str(run or part)
@@ -88,7 +87,7 @@ def kept_policy(folder: Path) -> Callable[[Mapping[str, Any]], Policy]:
     """How to make the policies of a data set in a folder from what its manifest says of them."""
 
     def trained(settings: Mapping[str, Any]) -> Policy:
-        from jbrep.rl.frozen import read_frozen  # imports torch
+        from jbrep.rl.policy import read_frozen  # imports torch
 
         return read_frozen(folder, settings)
 
@@ -123,7 +122,7 @@ def policy_names() -> str:
 
 def policy_file(source: str, task: Task | None) -> Path:
     """The path of the policy's file that a source names: that path, or the one that ships."""
-    return shipped.find(_needed(task, source)) if source == SHIPPED else Path(source)
+    return find_shipped(_needed(task, source)) if source == SHIPPED else Path(source)
 
 
 def find_player(source: str, task: Task | None = None, encoder: Any = None) -> Player:
@@ -196,9 +195,11 @@ def find_untrained(folder: Path, task: Task) -> Player:
 
 
 def _trained(source: str, task: Task | None, encoder: Any) -> Player:
-    from jbrep.rl.policy import load_run  # imports torch
+    from jbrep.rl.policy import (
+        load_run,  # imports torch
+        of_file,
+    )
     from jbrep.rl.policy_file import read
-    from jbrep.rl.trained import of_file
 
     folder = run_folder(source)
     trained = load_run(folder, encoder) if folder else of_file(read(policy_file(source, task)))

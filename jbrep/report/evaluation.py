@@ -6,20 +6,9 @@ from typing import NamedTuple
 from jbrep.encoders import FULL
 from jbrep.evaluate.diagnosis import SCALARS
 from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Lost, Score
-from jbrep.jitterbug.tasks import TASKS
 from jbrep.report.views import say
 from jbrep.text import SIGNIFICANT, Table, facts, html, number, r2_text, wrapped
 
-_WORDS = {
-    "orientation_w": "yaw",
-    "orientation_x": "tilt",
-    "orientation_y": "tilt",
-    "orientation_z": "yaw",
-    "velocity_z": "vertical speed",
-    "angular_velocity_x": "rate of tilt",
-    "angular_velocity_y": "rate of tilt",
-    "angular_velocity_z": "rate of yaw",
-}
 _MEASURES = {  # of which the first that the full observation tells anything of counts
     "rewarded": "the change of what the reward depends on",
     "reward": "the reward",
@@ -32,21 +21,13 @@ _CHOSEN_BY = "rewarded"  # whose interval is shown
 
 
 class Judged(NamedTuple):
-    """Which codes should serve a controller.
+    """Which codes should serve a controller."""
 
-    Attributes:
-        by: what decides, in words.
-        serving: the codes that should, the best first.
-        take: the smallest of these, if possible one that lacks nothing.
-        nearest: where none serves, the one that comes nearest, if one does.
-        unsaid: why nothing can be said; empty where something can.
-    """
-
-    by: str
-    serving: Sequence[str] = ()
-    take: str | None = None
-    nearest: str | None = None
-    unsaid: str = ""
+    by: str  # what decides, in words
+    serving: Sequence[str] = ()  # the codes that should, the best first
+    take: str | None = None  # the smallest of these, if possible one that lacks nothing
+    nearest: str | None = None  # where none serves, the one that comes nearest, if one does
+    unsaid: str = ""  # why nothing can be said; empty where something can
 
 
 def evaluation_text(
@@ -98,7 +79,6 @@ def judge(evaluation: Evaluation) -> Judged:
 
 
 def _headline(evaluation: Evaluation, judged: Judged) -> Table:
-    """What tells codes that serve from others: columns of which anything is known."""
     encoders = evaluation.encoders
     first = [name for name, scalar in SCALARS.items() if scalar.is_first]
     names = [n for n in first if any(_score(e, n).value is not None for e in encoders.values())]
@@ -126,7 +106,6 @@ def _r2(known: Diagnostics, name: str) -> str:
 
 
 def _hidden(evaluation: Evaluation) -> Iterator[Table]:
-    """How well what isn't seen can be read from each code, where the truth is known."""
     codes = evaluation.encoders.values()
     if hidden := evaluation.data.hidden:
         rows = [(n, *(r2_text(e.nonlinear_probes[n].value) for e in codes)) for n in hidden]
@@ -135,28 +114,18 @@ def _hidden(evaluation: Evaluation) -> Iterator[Table]:
 
 
 def _lacks_text(evaluation: Evaluation, width: int | None) -> str:
-    """What each code lacks of what a controller needs, as far as that can be said."""
     if reason := untold(evaluation):
         return wrapped(f"What each lacks can't be said: {reason}.", width)
-    told, task = {}, evaluation.data.task
+    told = {}
     for label, features in lacking(evaluation).items():
-        said: dict[str, float] = {}
-        for each in features:
-            said.setdefault(in_words(task, each.name), each.kept)
-        some = [f"{words} ({r2_text(kept)})" for words, kept in [*said.items()][:_MANY]]
-        more = [f"{len(said) - _MANY} more"] if len(said) > _MANY else []
+        some = [f"{each.name} ({r2_text(each.kept)})" for each in features[:_MANY]]
+        more = [f"{len(features) - _MANY} more"] if len(features) > _MANY else []
         told[label] = ", ".join((*some, *more)) or "nothing"
-    unread = dict.fromkeys(in_words(task, each.name) for each in evaluation.encoders[FULL].loses)
+    unread = [each.name for each in evaluation.encoders[FULL].loses]
     title = wrapped("What each lacks of what a controller needs (R² of reading it below .5)", width)
     nor = f"Nor can the full observation tell {', '.join(unread)}."
     lines = [title, facts(told, width, indent=0)] if told else []
     return "\n".join((*lines, *([wrapped(nor, width)] if unread else ())))
-
-
-def in_words(task: str, feature: str) -> str:
-    """What to call a feature to a reader; several of the Jitterbug's share their words."""
-    words = _WORDS if task in TASKS else {}
-    return words.get(feature, feature)
 
 
 def untold(evaluation: Evaluation) -> str:
@@ -182,7 +151,6 @@ def lacking(evaluation: Evaluation) -> dict[str, list[Lost]]:
 
 
 def _everything(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
-    """Every other diagnostic that is registered, and what each of them is."""
     others = [name for name, scalar in SCALARS.items() if not scalar.is_first]
     rows = [
         (label, *(number(_score(known, name).value, SIGNIFICANT) for name in others))

@@ -18,7 +18,7 @@ from jbrep.records.record import to_plain as record_to_plain
 from jbrep.report.tables import Tables
 from jbrep.rl.files import FAILED
 from jbrep.stats.analysis import Analysis, GroupAnalysis, to_plain
-from jbrep.stats.association import Diagnostic, associations
+from jbrep.stats.association import rank_correlation
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within, unless_few
 from jbrep.stats.labels import YES
 from jbrep.stats.runs import in_order
@@ -342,28 +342,38 @@ def _in_training(tables: Tables) -> dict[str, dict[str, float]]:
 
 def _diagnosed(tables: Tables, analysis: Analysis) -> Iterator[Diagnosed]:
     """Each registered diagnostic that is known of some code, with final returns."""
-    registered = [Diagnostic(name, each.words, each.better) for name, each in SCALARS.items()]
     families = {}
     for label in tables.record.labels.values():
         name, kind = label.settings.representation, label.encoder.kind
         families[label.settings.task, name] = name if kind == OWN else kind
-    for each in associations(
-        analysis.groups, tables.diagnostics, registered, families, analysis.seed
-    ):
-        yield Diagnosed(
-            **{"task": each.group.task, "algorithm": each.group.algorithm},
-            **{"diagnostic": each.diagnostic.name, "words": each.diagnostic.words},
-            better=each.diagnostic.better,
-            representations=[*each.representations],
-            values=each.values.tolist(),
-            final_returns=each.returns.tolist(),
-            families=[*each.families],
-            correlation=Score(*each.correlation.tolist()),
-        )
+    for group in analysis.groups:
+        returns = {
+            each.representation: float(each.numbers["final_return_mean"].value)
+            for each in group.labels
+        }
+        for name, scalar in SCALARS.items():
+            values = {each: tables.diagnostics.get((group.task, each), {}) for each in returns}
+            known = {n: each[name] for n, each in values.items() if each.get(name) is not None}
+            if not known:
+                continue
+            kin = [families[group.task, each] for each in known]
+            x, y = np.array([*known.values()]), np.array([returns[each] for each in known])
+            found = rank_correlation(scalar.better * x, y, kin, analysis.seed)
+            yield Diagnosed(
+                task=group.task,
+                algorithm=group.algorithm,
+                diagnostic=name,
+                words=scalar.words,
+                better=scalar.better,
+                representations=[*known],
+                values=x.tolist(),
+                final_returns=y.tolist(),
+                families=kin,
+                correlation=Score(*found.tolist()),
+            )
 
 
 def _scaling(labels: Sequence[Label]) -> Scaling | None:
-    """How the full state is scaled; None where no agent sees it."""
     full = [each for each in labels if each.settings.representation == FULL]
     if not full:
         return None
@@ -392,7 +402,6 @@ def _encoder(shared: Label) -> dict[str, Any]:
 
 
 def _settings(tables: Tables) -> dict[str, dict[str, Any]]:
-    """The settings that agents share, by task and algorithm, each by its name."""
     found: dict[str, dict[str, Any]] = {}
     for shared in tables.record.labels.values():
         settings, task = record_to_plain(shared.settings), shared.settings.environment
@@ -412,7 +421,6 @@ def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _imports(tables: Tables) -> list[str]:
-    """The modules of a study's own robots and encoders."""
     record = tables.record
     own = record.study.representations if record.study else ()
     codes = [each["code"] for each in own if isinstance(each, Mapping) and "code" in each]

@@ -30,21 +30,13 @@ _PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size o
 
 
 class Report(NamedTuple):
-    """What a study found.
+    """What a study found."""
 
-    Attributes:
-        folder: that has the page, the tables and the figures.
-        tables: what it is made from.
-        findings: what these say.
-        notes: what the diagnostics that were given are missing.
-        paths: of the findings, the page, the summary and the folder of the figures.
-    """
-
-    folder: Path
-    tables: Tables
-    findings: Findings
-    notes: list[str]
-    paths: list[Path]
+    folder: Path  # that has the page, the tables and the figures
+    tables: Tables  # what it is made from
+    findings: Findings  # what these say
+    notes: list[str]  # what the diagnostics that were given are missing
+    paths: list[Path]  # of the findings, the page, the summary and the folder of the figures
 
     @property
     def page(self) -> Path:
@@ -75,12 +67,8 @@ def make_report(
 ) -> Report:
     """Write the tables of the runs below a folder, if there are any, and the report of the tables.
 
-    Another process that reports of the same folder is waited for.
-
-    Args:
-        folder: with runs, of a study or not, or with the tables of a study alone.
-        out: folder for the report; the same one if not given.
-        evaluations: as for `jbrep.study.tables.add_diagnostics`.
+    Into `out`, or the same folder, which another process that reports there is waited for.
+    Evaluations are those of `jbrep.study.tables.add_diagnostics`.
     """
     out, ran = out or folder, has_runs(folder)
     if not ran:

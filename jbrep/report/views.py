@@ -217,7 +217,6 @@ def without_nothing(table: Table) -> Table:
 
 
 def _number(name: str, form: str = SIGNIFICANT) -> Callable[[Agents | Comparison], str]:
-    """A column of one of their numbers."""
     return lambda each: interval(each.numbers[name], form)
 
 

@@ -11,10 +11,15 @@ from typing import Any, cast
 import gymnasium
 import numpy as np
 import torch
+from colorednoise import powerlaw_psd_gaussian
 from gymnasium import spaces
-from gymnasium.spaces.utils import flatdim
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    NormalActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+)
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -30,7 +35,7 @@ from jbrep.records.container import Tensors
 from jbrep.records.record import to_plain
 from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.normalization import Statistics, normalized
-from jbrep.rl.presets import LINEAR, Hyperparameters, sb3_class
+from jbrep.rl.presets import LINEAR, Hyperparameters, NormalNoise, OrnsteinUhlenbeckNoise, sb3_class
 from jbrep.training.trainer import allocate_adam_state, single_torch_thread
 
 Preprocess = Callable[[NDArray[np.float32]], NDArray[np.float32]]
@@ -100,21 +105,14 @@ def make_agent(
 ) -> BaseAlgorithm:
     """An untrained agent, with its optimisers' state allocated.
 
-    Its `action_repeat` is for whoever plays its policy, and in policy.zip.
-
-    Args:
-        algorithm: a key of CLASSES.
-        hyperparameters: of the agent.
-        env: where it acts.
-        seed: of weights and of what it draws.
-        episode_steps: of the longest episode, for noise that is drawn for an episode at once.
-        device: of its networks: cpu or cuda.
+    Its `action_repeat` is for whoever plays its policy, and in policy.zip. The steps of the longest
+    episode are for noise that is drawn for an episode at once.
     """
     of_class = {name: _argument(v) for name, v in hyperparameters.algorithm_kwargs.items()}
     of_policy, of_adam = hyperparameters.policy_kwargs, hyperparameters.optimizer_kwargs
     if hyperparameters.noise:
-        size = np.prod(env.action_space.shape or (), dtype=int)
-        of_class["action_noise"] = hyperparameters.noise.make(int(size), episode_steps)
+        size = int(np.prod(env.action_space.shape or (), dtype=int))
+        of_class["action_noise"] = _noise(hyperparameters.noise, size, episode_steps)
     with warnings.catch_warnings(record=True) as told:
         agent: Any = sb3_class(algorithm)(
             "MlpPolicy",
@@ -154,6 +152,47 @@ def global_random_state_kept() -> Iterator[None]:
 def action_repeat(agent: BaseAlgorithm) -> int:
     """Control steps for which each action of an agent is held; 1 if it doesn't say."""
     return int(getattr(agent, "action_repeat", 1))
+
+
+class ColouredActionNoise(ActionNoise):
+    """Coloured noise of one environment, from the generator that stable-baselines3 draws from.
+
+    On `size` numbers, for episodes of so many steps. `ahead` is drawn for the steps to come, (m,
+    size).
+    """
+
+    def __init__(self, beta: float, sigma: float, size: int, steps: int):
+        super().__init__()
+        self._beta, self._sigma, self._shape = (
+            beta,
+            sigma,
+            (size, max(steps, 2)),
+        )  # fewer have no spectrum
+        self.ahead: NDArray[np.float64]
+        self.reset()
+
+    def __call__(self) -> NDArray[Any]:
+        if not len(self.ahead):
+            generator = np.random.mtrand._rand
+            unit = powerlaw_psd_gaussian(self._beta, self._shape, random_state=generator)
+            self.ahead = np.ascontiguousarray(self._sigma * unit.T)
+        now, self.ahead = self.ahead[0], self.ahead[1:]
+        return now.astype(np.float32)
+
+    def reset(self) -> None:
+        self.ahead = np.zeros((0, self._shape[0]))
+
+
+def _noise(chosen: Any, size: int, steps: int) -> ActionNoise:
+    """The noise of one environment, on `size` numbers, for episodes of so many steps."""
+    match chosen:
+        case NormalNoise(sigma=sigma):
+            return NormalActionNoise(np.zeros(size), np.full(size, sigma))
+        case OrnsteinUhlenbeckNoise(mean=mean, sigma=sigma, theta=theta):
+            about, sigmas = np.full(size, mean), np.full(size, sigma)
+            return OrnsteinUhlenbeckActionNoise(about, sigmas, theta)
+        case _:
+            return ColouredActionNoise(chosen.beta, chosen.sigma, size, steps)
 
 
 def _argument(value: Any) -> Any:
@@ -212,14 +251,14 @@ def deterministic_actor(
     """
     policy.set_training_mode(False)
     low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
-    is_scaled, space = is_action_scaled(policy.action_space), policy.observation_space
+    is_scaled = is_action_scaled(policy.action_space)
 
     def act(observation: Array) -> NDArray[np.float32]:
         size = batch_size or len(observation)
         batches = torch.from_numpy(observation.astype(np.float32)).split(size)
         with single_torch_thread(), torch.no_grad(), unchecked_distributions():
             chosen = [
-                policy._predict(_as_observed(space, preprocess(each.numpy()), policy.device), True)
+                policy._predict(torch.from_numpy(preprocess(each.numpy())).to(policy.device), True)
                 for each in batches
             ]
         actions = torch.cat(chosen).numpy(force=True)
@@ -227,19 +266,6 @@ def deterministic_actor(
         return np.clip(task.unscale_action(own).astype(np.float32) if is_scaled else own, low, high)
 
     return act
-
-
-def _as_observed(
-    space: gymnasium.Space[Any], rows: NDArray[np.float32], device: torch.device
-) -> Any:
-    """Flat rows (n, d) in the form in which a policy takes the observations of its space."""
-    if isinstance(space, spaces.Dict):
-        ends = np.cumsum([flatdim(part) for part in space.spaces.values()])[:-1]
-        parts = zip(space.spaces.items(), np.split(rows, ends, 1), strict=True)
-        return {name: _as_observed(part, own, device) for (name, part), own in parts}
-    if isinstance(space, spaces.Discrete):
-        return torch.as_tensor(rows.argmax(1), device=device)
-    return torch.as_tensor(rows.reshape(len(rows), *(space.shape or ())), device=device)
 
 
 def is_action_scaled(space: gymnasium.Space[Any]) -> bool:
@@ -261,53 +287,22 @@ def statistics_of(agent: BaseAlgorithm) -> Statistics | None:
 
 
 def restore_statistics(agent: BaseAlgorithm, tensors: Tensors, source: object) -> None:
-    """Let an agent that normalises go on from the statistics among tensors, see `Statistics.read`.
-
-    Raises:
-        DamageError: they aren't there, or don't fit.
-    """
+    """Let an agent that normalises go on from the statistics among tensors."""
     if env := agent.get_vec_normalize_env():
         (size,) = agent.observation_space.shape or ()
         Statistics.read(tensors, size, source).give(env)
 
 
-class Evaluator:
-    """Plays deterministic policies, in the same episodes each time.
+def evaluate(agent: BaseAlgorithm, lanes: Lanes, encoder: BaseEncoder, episodes: int) -> Outcome:
+    """What comes of an agent's deterministic policy in the same episodes each time.
 
-    Args:
-        lanes: to play in.
-        encoder: the policy's view of the observation.
-        episodes: how many are played.
-        seed: of the first episode; the others take the numbers that follow.
+    What it normalises, it normalises by its statistics so far, which stay as they are.
+
+    Raises:
+        NonFiniteActionError: the policy's actions are not finite.
+        EnvironmentFailedError: the environment fails in the middle of an episode.
     """
-
-    def __init__(
-        self,
-        lanes: Lanes,
-        encoder: BaseEncoder,
-        episodes: int,
-        seed: int = EVALUATION_SEED,
-    ):
-        self._lanes = lanes
-        self._encoder, self._seed, self._episodes = encoder, seed, episodes
-
-    def close(self) -> None:
-        """Free what the environments hold."""
-        self._lanes.close()
-
-    def outcome(self, agent: BaseAlgorithm, episodes: int | None = None) -> Outcome:
-        """What comes of each episode: as many as are played at once, or as asked for.
-
-        What an agent normalises, it normalises by its statistics so far, which stay as they are.
-
-        Raises:
-            NonFiniteActionError: the policy's actions are not finite.
-            EnvironmentFailedError: the environment fails in the middle of an episode.
-        """
-        preprocess = preprocessor(self._encoder.encode, statistics_of(agent))
-        act = deterministic_actor(agent.policy, self._lanes.task, preprocess)
-        repeat = action_repeat(agent)
-        count = self._episodes if episodes is None else episodes
-        seeds = range(self._seed, self._seed + count, self._lanes.num_lanes)
-        played = (whole_outcome(self._lanes, lambda: held(act, repeat), seed) for seed in seeds)
-        return joined(played, count)
+    preprocess = preprocessor(encoder.encode, statistics_of(agent))
+    act, repeat = deterministic_actor(agent.policy, lanes.task, preprocess), action_repeat(agent)
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + episodes, lanes.num_lanes)
+    return joined((whole_outcome(lanes, lambda: held(act, repeat), s) for s in seeds), episodes)

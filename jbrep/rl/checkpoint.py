@@ -23,24 +23,20 @@ from stable_baselines3.common.noise import (
 
 from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import EnvironmentFailedError
-from jbrep.errors import DamageError, InputError, differences
+from jbrep.errors import InputError, differences
 from jbrep.records import container
 from jbrep.records.container import Tensors, without
 from jbrep.records.document import Document, document_from
 from jbrep.records.record import Version
 from jbrep.records.storage import exists
-from jbrep.rl.action_noise import ColouredActionNoise
-from jbrep.rl.agent import acting, parameters, restore_statistics, statistics_of
-from jbrep.rl.files import (
-    CHECKPOINT,
-    FAILED,
-    RUN,
-    Episode,
-    Evaluation,
-    Info,
-    RunRecord,
-    read_run,
+from jbrep.rl.agent import (
+    ColouredActionNoise,
+    acting,
+    parameters,
+    restore_statistics,
+    statistics_of,
 )
+from jbrep.rl.files import CHECKPOINT, FAILED, RUN, Episode, Evaluation, Info, RunRecord, read_run
 from jbrep.rl.history import History
 from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_STEPS
@@ -55,31 +51,24 @@ _MEMORIES: dict[type, str] = {  # of noises that depend on what was drawn before
 _UNSCALED = "_last_original_obs"  # before it was normalised
 _EXPLORATION = ("exploration_mat", "exploration_matrices")
 _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-_MALFORMED = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 
 
 class Header(Document, frozen=True, kw_only=True):
-    """The header of a checkpoint.
-
-    Attributes:
-        settings: of the run.
-        versions: by package; these and the settings must be equal for the run to resume.
-        step: of training.
-        episodes, evaluations, infos, seconds: of the history so far.
-        counters: of the agent and its random numbers, as plain JSON.
-    """
+    """The header of a checkpoint."""
 
     format = "jbrep checkpoint"
     format_version = 5
 
-    settings: RunSettings
+    settings: RunSettings  # of the run
+    # by package; these and the settings must be equal for the run to resume
     versions: Mapping[Version, Version]
-    step: Annotated[int, Meta(ge=0, le=MAX_STEPS)]
+    step: Annotated[int, Meta(ge=0, le=MAX_STEPS)]  # of training
+    # episodes, evaluations, infos, seconds: of the history so far
     episodes: list[Episode]
     evaluations: list[Evaluation]
     infos: list[Info]
     seconds: float
-    counters: Mapping[str, Any]
+    counters: Mapping[str, Any]  # of the agent and its random numbers, as plain JSON
 
     @property
     def history(self) -> History:
@@ -98,64 +87,39 @@ class Checkpoint(NamedTuple):
 
     @classmethod
     def read(cls, folder: Path) -> "Checkpoint":
-        """The one in a run's folder.
-
-        Raises:
-            DamageError: it isn't what was written.
-        """
+        """The one in a run's folder."""
         path = folder / CHECKPOINT
         tensors, header = container.read(path, "checkpoint")
         return cls(path, document_from(header, path, Header), tensors)
 
     def restore(self, agent: BaseAlgorithm) -> None:
-        """Bring an agent that is set up to learn to where the checkpoint was taken.
-
-        Raises:
-            DamageError: what it holds doesn't fit the agent.
-        """
+        """Bring an agent that is set up to learn to where the checkpoint was taken."""
         try:
             _restore(agent, self.tensors, self.header.counters)
         except EnvironmentFailedError as error:
             raise InputError(f"{self.path} can't be resumed: {error}") from None
-        except InputError:
-            raise
-        except _MALFORMED:
-            raise DamageError(f"{self.path} is damaged: delete it to start over") from None
 
 
 def read_header(folder: Path) -> Header | None:
-    """The header of a run's checkpoint, without the rest, which can be large; None without one.
-
-    Raises:
-        DamageError: it isn't what was written.
-    """
+    """The header of a run's checkpoint, without the rest, which can be large; None without one."""
     path = folder / CHECKPOINT
     return document_from(container.peek(path), path, Header) if exists(path) else None
 
 
 def run_settings(folder: Path) -> RunSettings:
-    """The settings of a run that has ended or has a checkpoint.
-
-    Raises:
-        DamageError: a file isn't what was written.
-    """
+    """The settings of a run that has ended or has a checkpoint."""
     header = None if exists(folder / RUN) else read_header(folder)
     return header.settings if header else read_run(folder).settings
 
 
 class Standing(NamedTuple):
-    """How far a run has come in its folder.
+    """How far a run has come in its folder."""
 
-    Attributes:
-        settings: of the run, with evaluations as far apart as before where the run leaves that
-            open.
-        ended: the contents of run.json, if the run has ended; it may have gone on from fewer steps.
-        resumes: whether it goes on from its checkpoint.
-    """
-
+    # of the run, with evaluations as far apart as before where the run leaves that open
     settings: RunSettings
+    # the contents of run.json, if the run has ended; it may have gone on from fewer steps
     ended: RunRecord | None = None
-    resumes: bool = False
+    resumes: bool = False  # whether it goes on from its checkpoint
 
 
 def standing(
@@ -360,12 +324,10 @@ def _buffer(agent: BaseAlgorithm) -> ReplayBuffer | None:
 
 
 def _filled(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
-    """Views of the filled part of the buffer."""
     size = buffer.buffer_size if buffer.full else buffer.pos
     return {name: getattr(buffer, name)[:size] for name in _TRANSITIONS}
 
 
 def _noises(agent: BaseAlgorithm) -> Sequence[ActionNoise]:
-    """The action noise of each environment, if there is any."""
     noise = getattr(agent, "action_noise", None)
     return noise.noises if isinstance(noise, VectorizedActionNoise) else [noise] if noise else []

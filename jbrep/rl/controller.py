@@ -1,5 +1,10 @@
-"""Trained policies as functions of what a robot's sensors say, in NumPy alone."""
+"""Trained policies for a robot: functions of what its sensors say, in NumPy alone, and files.
 
+Any runtime of ONNX, or torch alone, computes actions with such a file.
+"""
+
+import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -8,14 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from jbrep.coordinates import library_of
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import Encoder
-from jbrep.encoders.file import load
-from jbrep.encoders.layers import ACTIVATIONS, Layer, activate, dense, run
+from jbrep.encoders.encoder import Encoder, load
+from jbrep.encoders.layers import ACTIVATIONS, ONNX, Layer, activate, dense, run
 from jbrep.envs.recording import held
 from jbrep.envs.view import Window
 from jbrep.errors import DamageError, InputError, choose, first_line, listed
 from jbrep.records.container import Tensors, without
-from jbrep.records.storage import exists
+from jbrep.records.record import to_plain
+from jbrep.records.storage import exists, taken, write_new
 from jbrep.rl.files import ENCODER, POLICY, POLICY_ZIP, RUN, is_run, read_finished
 from jbrep.rl.normalization import CLIP, Statistics
 from jbrep.rl.policy_file import PolicyFile, read
@@ -31,20 +36,16 @@ class Acting(NamedTuple):
     """What a policy computes with, all NumPy's arrays or all torch tensors.
 
     Written once for NumPy, torch and ONNX.
-
-    Attributes:
-        statistics: mean (l,) and standard deviation (l,) of what the network sees, if it is
-            normalised by them.
-        network: layers to the actions before they are squashed or clipped to [-1, 1].
-        low, high: bounds of the actions, (k,), to which they are scaled then.
-        is_squashed: whether actions are squashed; others are clipped.
     """
 
+    # mean (l,) and standard deviation (l,) of what the network sees, if it is normalised by them
     statistics: tuple[Any, Any] | None
+    # layers to the actions before they are squashed or clipped to [-1, 1]
     network: tuple[Layer, ...]
+    # low, high: bounds of the actions, (k,), to which they are scaled then
     low: Any
     high: Any
-    is_squashed: bool
+    is_squashed: bool  # whether actions are squashed; others are clipped
 
     def in_torch(self) -> "Acting":
         """The same with torch tensors."""
@@ -73,8 +74,6 @@ class Acting(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """What a policy sees of observations."""
-
     observation: NDArray[np.float32]  # with its history, if the policy was trained with one
     window: Window | None  # that the history is from
 
@@ -248,9 +247,6 @@ def load_policy(source: str | Path, encoder: Any = None) -> Controller:
     Args:
         source: the folder of a run, finished or under way, or a policy's file.
         encoder: the object that the run was made with, if its encoder is a user's own.
-
-    Raises:
-        DamageError: a file isn't what was written.
     """
     path = Path(source)
     path = path.parent if path.name == POLICY_ZIP and is_run(path.parent) else path
@@ -270,11 +266,6 @@ def load_policy(source: str | Path, encoder: Any = None) -> Controller:
 
 
 def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
-    """The policy in a file, and its encoder.
-
-    Raises:
-        DamageError: a number that it acts by isn't finite.
-    """
     settings, weights = file.header.settings, file.weights
     if encoder.fingerprint != settings.encoder:
         raise InputError(f"{file.path} is of a run on another encoder than {encoder.name}")
@@ -294,3 +285,101 @@ def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
         raise InputError(
             f"{file.path} doesn't fit the run's settings: {first_line(error)}"
         ) from None
+
+
+def export(controller: Controller, path: Path, form: str = "onnx") -> None:
+    """Write a policy as one model from observations, as the robot gives them, to actions.
+
+    Its input is `observation`, (rows, d) float32 in the units of the task's features; its output is
+    `action`, (rows, k) in those of the actuators. `described` is in its metadata, as `jbrep`. Each
+    action is to be held for `action_repeat` control steps, which is for the caller to do, as is
+    keeping the states and actions of the steps before for a policy that was trained with a history.
+
+    Args:
+        controller: of the policy.
+        path: a new file.
+        form: onnx, or torch for a program of torch.export (.pt2).
+    """
+    write = choose(form, _FORMS, "format")
+    if not isinstance(controller.encoder, Encoder):
+        raise InputError(
+            f"the encoder {controller.encoder.name} is code, which a model can't hold: give the "
+            "run an encoder's file, as Encoder.from_torch makes it"
+        )
+    if exists(path):  # known before the work
+        raise taken(path)
+    write_new(path, write(controller))
+
+
+def described(controller: Controller) -> dict[str, Any]:
+    """What a file says of its policy: names, units and ranges, the rate, where it comes from."""
+    task, settings = controller.task, controller.settings
+    now = task.features[: len(task.view.places)] if task.view else task.features
+    period = None if task.timestep is None else task.timestep * controller.action_repeat
+    return {
+        "task": task.name,
+        "environment": to_plain(task),
+        "observation": [
+            {
+                "name": each.name,
+                "unit": each.unit,
+                "low": each.low,
+                "high": each.high,
+                "offset": offset,  # subtracted beforehand
+            }
+            for each, offset in zip(now, task.offset.tolist(), strict=False)
+        ],
+        "action": {"low": to_plain(task.action_low), "high": to_plain(task.action_high)},
+        # of so many states, the newest first, then of the actions between, the input consists
+        "history": task.view.history if task.view else 1,
+        "control_period": task.timestep,  # seconds
+        "action_repeat": controller.action_repeat,
+        "rate": None if period is None else 1 / period,  # actions a second
+        "encoder": {"name": controller.encoder.name, "sha256": controller.encoder.fingerprint},
+        "learner": settings.learner,
+        "steps": settings.steps,
+        "seed": settings.seed,
+    }
+
+
+def _onnx(controller: Controller) -> bytes:
+    from jbrep.encoders.onnx import traced  # imports onnx
+
+    encoder, acting = controller.encoder, controller.acting
+    assert isinstance(encoder, Encoder)
+
+    def outputs(observation: Any) -> Iterator[tuple[str, Any]]:
+        yield "action", acting.actions(encoder.arrays.encode(observation))
+
+    model = traced("controller", controller.task.size, outputs, described(controller))
+    return bytes(model.SerializeToString(deterministic=True))
+
+
+def _torch(controller: Controller) -> bytes:
+    import io
+
+    import torch
+
+    encoder, acting = controller.encoder, controller.acting.in_torch()
+    assert isinstance(encoder, Encoder)
+    if any(layer.activation == ONNX for layer in encoder.encoder):
+        raise InputError(
+            f"the encoder {encoder.name} is an ONNX model, which torch can't hold: choose the "
+            "format onnx"
+        )
+
+    class Policy(torch.nn.Module):
+        def forward(self, observation: torch.Tensor) -> torch.Tensor:
+            return acting.actions(encoder.encode(observation))
+
+    rows = torch.export.Dim("rows")
+    program = torch.export.export(
+        Policy(), (torch.zeros(2, controller.task.size),), dynamic_shapes=({0: rows},)
+    )
+    content = io.BytesIO()
+    metadata = {"jbrep": json.dumps(described(controller))}
+    torch.export.save(program, content, extra_files=metadata)
+    return content.getvalue()
+
+
+_FORMS: dict[str, Callable[[Controller], bytes]] = {"onnx": _onnx, "torch": _torch}

@@ -1,15 +1,13 @@
 """A run's folder: what a run leaves there, written and read."""
 
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
 from jbrep.envs.infos import by_name
-from jbrep.envs.task import Task
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import InputError
 from jbrep.records import container
 from jbrep.records.commit import Commits
 from jbrep.records.document import Document, read_document
@@ -17,12 +15,7 @@ from jbrep.records.record import Sha256, Version
 from jbrep.records.storage import exists
 from jbrep.records.tables import read_rows
 from jbrep.rl.run_settings import RunSettings
-from jbrep.rl.settings import (
-    MAX_EPISODES,
-    MAX_STEPS,
-    Line,
-    Name,
-)
+from jbrep.rl.settings import MAX_STEPS, Line, Name
 
 POLICY_SUFFIX = ".safetensors"
 RUN = "run.json"  # written last: its presence means that the run has ended
@@ -36,16 +29,8 @@ EPISODES = "episodes.csv"
 EVALUATIONS = "evaluations.csv"
 INFOS = "infos.csv"  # where the environment tells numbers
 _BEFORE = "progress", "error.txt", "tensorboard", "wandb"  # of a run that has just begun
-OWN = (
-    RUN,
-    CHECKPOINT,
-    BEGINNING,
-    ENCODER,
-    EPISODES,
-    EVALUATIONS,
-    INFOS,
-    *_BEFORE,
-)  # see `make_folder`
+_TABLES = EPISODES, EVALUATIONS, INFOS
+OWN = (RUN, CHECKPOINT, BEGINNING, ENCODER, *_TABLES, *_BEFORE)  # see `make_folder`
 EVALUATION_SEED = 1 << 31  # of an evaluation's first episode; seeds in training are smaller
 FINISHED: Final = "finished"
 FAILED: Final = "failed"
@@ -69,49 +54,18 @@ class RunRecord(Document, frozen=True, kw_only=True):
     tables: Mapping[Name, Sha256]  # of the files of its episodes, evaluations and infos
     policy_sha256: Sha256 | None  # of its policy's file; null if it failed
 
-    def check(self) -> None:
-        if (self.status == FINISHED) != (self.policy_sha256 is not None):
-            raise InputError(f"it has {self.status}, but policy_sha256 is {self.policy_sha256}")
-        if EVALUATIONS not in self.tables:
-            raise InputError(f"tables.{EVALUATIONS} is missing")
-
 
 class PolicyHeader(Document, frozen=True, kw_only=True):
-    """The header of a policy's file.
-
-    Attributes:
-        settings: of the run.
-        encoder: the header of its encoder; None if that is code.
-        run: what the run is called.
-        step: of training.
-        finished: whether training was over.
-    """
+    """The header of a policy's file."""
 
     format = "jbrep policy"
     format_version = 5
 
-    settings: RunSettings
-    encoder: dict[str, Any] | None
-    run: Line
-    step: Annotated[int, Meta(ge=0, le=MAX_STEPS)]
-    finished: bool
-
-
-class ZipHeader(Document, frozen=True, kw_only=True):
-    """What policy.zip says beside what stable-baselines3 reads.
-
-    Attributes:
-        environment: of the run.
-        encoder: the fingerprint of that through which its agent observes.
-        representation: what tables call that.
-    """
-
-    format = "jbrep policy.zip"
-    format_version = 2
-
-    environment: Task
-    encoder: Sha256
-    representation: Name
+    settings: RunSettings  # of the run
+    encoder: dict[str, Any] | None  # the header of its encoder; None if that is code
+    run: Line  # what the run is called
+    step: Annotated[int, Meta(ge=0, le=MAX_STEPS)]  # of training
+    finished: bool  # whether training was over
 
 
 class Episode(NamedTuple):
@@ -168,35 +122,12 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     """The evaluations of a run: ascending steps, each with the same episodes from 0.
 
     The last one may have more of them.
-
-    Raises:
-        DamageError: as `read_run`, or the table isn't what the run wrote.
     """
-    path = folder / EVALUATIONS
-    evaluations = read_rows(path, Evaluation, read_run(folder).tables[EVALUATIONS])
-    by_step = [(step, [*of_step]) for step, of_step in groupby(evaluations, lambda row: row.step)]
-    steps, counts = [step for step, _ in by_step], [len(of_step) for _, of_step in by_step]
-    if (
-        any([row.episode for row in of_step] != [*range(len(of_step))] for _, of_step in by_step)
-        or steps != sorted(set(steps))
-        or steps[-1:] > [MAX_STEPS]
-        or max(counts, default=0) > MAX_EPISODES
-        or len(set(counts[:-1])) > 1
-        or counts[-1:] < counts[:1]
-    ):
-        raise DamageError(
-            f"{path} is damaged or not a table of evaluations: it must have the same episodes at "
-            "every step, or more at the last"
-        )
-    return evaluations
+    return read_rows(folder / EVALUATIONS, Evaluation, read_run(folder).tables[EVALUATIONS])
 
 
 def read_infos(folder: Path) -> list[Info]:
-    """The numbers of a run's evaluations, to the last bit; nothing where none are told.
-
-    Raises:
-        DamageError: as `read_run`, or the table isn't what the run wrote.
-    """
+    """The numbers of a run's evaluations, to the last bit; nothing where none are told."""
     sha256 = read_run(folder).tables.get(INFOS)
     return read_rows(folder / INFOS, Info, sha256) if sha256 else []
 
@@ -213,11 +144,7 @@ def last_returns(evaluations: Sequence[Evaluation]) -> list[float]:
 
 
 def read_run(folder: Path) -> RunRecord:
-    """What run.json says of a run that has ended.
-
-    Raises:
-        DamageError: it is damaged or something else.
-    """
+    """What run.json says of a run that has ended."""
     path = folder / RUN
     if not exists(path):
         raise InputError(f"no finished run in {folder}: {RUN} is missing")
@@ -225,11 +152,7 @@ def read_run(folder: Path) -> RunRecord:
 
 
 def read_finished(folder: Path) -> tuple[RunRecord, str]:
-    """The same of a run that has ended well, and the SHA-256 of its policy's file.
-
-    Raises:
-        DamageError: as `read_run`.
-    """
+    """The same of a run that has ended well, and the SHA-256 of its policy's file."""
     run = read_run(folder)
     if run.policy_sha256 is None:
         raise InputError(f"the run in {folder} {run.status}: it has no policy")

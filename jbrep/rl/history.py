@@ -1,35 +1,45 @@
-"""What a run has recorded so far."""
+"""What a run has recorded so far, and where it is shown: on a terminal, and in logs."""
 
+import hashlib
+import json
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
+from numbers import Real
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
+from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.envs.recording import Outcome
-from jbrep.records.tables import rounded
+from jbrep.errors import first_line
+from jbrep.progress import Progress
+from jbrep.records import tables
+from jbrep.records.record import to_plain
 from jbrep.rl.files import Episode, Evaluation, Info
+from jbrep.rl.run_settings import RunSettings
+from jbrep.text import rounded, sparkline
+
+_LINE = "{desc}: {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"  # on a terminal
+_NAME, _CURVE = 16, 10  # letters and blocks in it, at most
+_TENSORBOARD = "tensorboard"  # what is kept from it is kept from Weights & Biases, too
 
 
 @dataclass
 class History:
-    """What a run has recorded so far, over all the processes that worked on it.
+    """What a run has recorded so far, over all the processes that worked on it."""
 
-    Attributes:
-        episodes: of training.
-        evaluations: of the deterministic policy.
-        infos: what the environment told at the ends of their episodes.
-        seconds_before: wall time of earlier processes [s].
-        first_step: the training step from which this process continues.
-        means: mean return of each evaluation; progress asks for it at every rollout.
-    """
-
-    episodes: list[Episode] = field(default_factory=list)
-    evaluations: list[Evaluation] = field(default_factory=list)
+    episodes: list[Episode] = field(default_factory=list)  # of training
+    evaluations: list[Evaluation] = field(default_factory=list)  # of the deterministic policy
+    # what the environment told at the ends of their episodes
     infos: list[Info] = field(default_factory=list)
-    seconds_before: float = 0.0
-    first_step: int = 0
+    seconds_before: float = 0.0  # wall time of earlier processes [s]
+    first_step: int = 0  # the training step from which this process continues
+    # mean return of each evaluation; progress asks for it at every rollout
     means: list[float] = field(init=False)
     _started: float = field(default_factory=time.monotonic)
 
@@ -47,7 +57,7 @@ class History:
 
     def add(self, step: int, outcome: Outcome) -> None:
         """Record an evaluation after so many steps."""
-        returns: Sequence[float] = [rounded(each) for each in outcome.returns]
+        returns: Sequence[float] = [tables.rounded(each) for each in outcome.returns]
         self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(returns)]
         told = enumerate(outcome.numbers)
         self.infos += [Info(step, i, *each) for i, numbers in told for each in numbers.items()]
@@ -58,3 +68,124 @@ class History:
         self.evaluations = [row for row in self.evaluations if row.step < step]
         self.infos = [row for row in self.infos if row.step < step]
         self.means = self._means()
+
+
+class Bar:
+    """A line of progress, from the step on at which the run starts or resumes.
+
+    On a terminal it has a curve of the evaluations' mean returns, and fits 80 columns.
+    """
+
+    def __init__(self, steps: int, name: str):
+        self._steps = steps
+        self._name = name if len(name) <= _NAME else f"{name[: _NAME - 3]}..."
+        self._progress: Any = None
+
+    def show(self, history: History, step: int) -> None:
+        """Show the steps so far and the mean returns of the evaluations.
+
+        The final evaluation can take minutes: all steps are told before it, and after it again.
+        """
+        if self._progress is None:
+            self._progress = Progress(
+                total=self._steps,
+                initial=step,
+                desc=self._name,
+                unit="",
+                unit_scale=True,
+                delay=0.5,
+                bar_format=_LINE,
+            )
+        is_final = self._progress.n < self._steps <= step
+        self._progress.update(min(step, self._steps) - self._progress.n)
+        shown = "final ones under way" if is_final else self._course(history.means)
+        self._progress.set_postfix(returns=shown, refresh=is_final)
+
+    def _course(self, means: Sequence[float]) -> str:
+        """The last mean return, after a curve of all where there are Unicode's blocks."""
+        if not means:
+            return "-"
+        curve = "" if self._progress.ascii else sparkline(means, _CURVE)
+        return f"{curve} {rounded(means[-1])[0]}".strip()
+
+    def close(self) -> None:
+        """End the line."""
+        if self._progress is not None:
+            self._progress.close()
+
+
+class ControlStepsLogger(Logger):
+    """stable-baselines3's logger, that tells writers control steps instead of its agent's."""
+
+    def __init__(self, settings: RunSettings, writers: list[KVWriter]):
+        super().__init__(None, writers)
+        self._settings = settings
+
+    def dump(self, step: int = 0) -> None:
+        super().dump(self._settings.control_steps(step))
+
+
+class Scalars(TensorBoardOutputFormat):
+    """TensorBoard's file after a step; later ones of an earlier process are hidden."""
+
+    def __init__(self, folder: Path, step: int):
+        self.writer = SummaryWriter(str(folder), purge_step=step + 1)
+        self._is_closed = False
+
+
+class Tracker(KVWriter):
+    """Logs to Weights & Biases what TensorBoard gets, from the first record on.
+
+    Whatever goes wrong there is said once, in a line, and the run goes on. The environment's
+    WANDB_MODE decides whether it is online, offline or disabled.
+
+    Args:
+        project: of Weights & Biases.
+        folder: of the run; its name is the run's there, and files are kept in it.
+        settings: of the run.
+    """
+
+    def __init__(self, project: str, folder: Path, settings: RunSettings):
+        import wandb  # an extra: where it is missing, that is known before training
+
+        self._project, self._folder, self._settings = project, folder, to_plain(settings)
+        self._wandb: Any = wandb
+        self._run: Any = None
+        self._failed = False
+
+    def write(
+        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
+    ) -> None:
+        numbers = {
+            name: float(value)
+            for name, value in key_values.items()
+            if isinstance(value, Real) and _TENSORBOARD not in (key_excluded[name] or ())
+        }
+        if self._failed:
+            return
+        try:
+            self._run = self._run or self._begin()
+            self._run.log({**numbers, "step": step})
+        except Exception as error:  # of its many kinds none may end a run
+            self._failed = True
+            reason = first_line(error)
+            print(f"Weights & Biases: {reason}; the run goes on without it", file=sys.stderr)
+
+    def close(self) -> None:
+        if self._run and not self._failed:
+            try:
+                self._run.finish()
+            except Exception:  # the run's own files are complete
+                self._failed = True
+
+    def _begin(self) -> Any:
+        text = json.dumps([self._project, str(self._folder), self._settings], sort_keys=True)
+        return self._wandb.init(
+            project=self._project,
+            name=self._folder.name,
+            id=hashlib.sha256(text.encode()).hexdigest()[:16],  # that a resumed run finds again
+            resume="allow",
+            config=self._settings,
+            dir=str(self._folder),
+            settings=self._wandb.Settings(silent=True, console="off"),
+        )

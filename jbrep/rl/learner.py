@@ -22,21 +22,15 @@ _MOST_LETTERS = 60  # of a name made from overrides
 
 
 class Learner(Record, frozen=True, kw_only=True):
-    """An algorithm with its hyperparameters.
+    """An algorithm with its hyperparameters."""
 
-    Attributes:
-        name: what tables call it: ddpg, with the preset paper; sac-modern, with another; or a name
-            of the user's.
-        algorithm: a key of CLASSES.
-        preset: the base, a key of PRESETS.
-        overrides: what is set differently there.
-        draws: the values of settings, one of which each seed of a study draws.
-    """
-
+    # what tables call it: ddpg, with the preset paper; sac-modern, with another; or a name of the
+    # user's
     name: LearnerName
-    algorithm: str
-    preset: str
-    overrides: Mapping[str, Any] = {}
+    algorithm: str  # a key of CLASSES
+    preset: str  # the base, a key of PRESETS
+    overrides: Mapping[str, Any] = {}  # what is set differently there
+    # the values of settings, one of which each seed of a study draws
     draws: Mapping[str, tuple[Any, ...]] = {}
 
     @classmethod
@@ -125,7 +119,6 @@ class Learner(Record, frozen=True, kw_only=True):
 
 
 def _draws(given: Any) -> dict[str, tuple[Any, ...]]:
-    """The values by setting that a table says."""
     if not isinstance(given, dict) or not all(isinstance(v, list) and v for v in given.values()):
         raise InputError(
             f"draws is {given!r}: it must be a table of lists, such as "

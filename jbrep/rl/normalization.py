@@ -22,20 +22,14 @@ _KEPT = ("mean", "variance", "count")  # in files: jbrep's own have one clip and
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """The running mean and variance of each of the numbers that an agent sees.
+    """The running mean and variance of each of the numbers that an agent sees."""
 
-    Attributes:
-        mean, variance: of each number.
-        count: of observations.
-        clip: the limit of what is normalised, in standard deviations; of all or of each number.
-        epsilon: added to the variance.
-    """
-
+    # mean, variance: of each number
     mean: Array  # (size,)
     variance: Array  # (size,)
-    count: float
-    clip: Array | float = CLIP
-    epsilon: float = _EPSILON
+    count: float  # of observations
+    clip: float = CLIP  # the limit of what is normalised, in standard deviations
+    epsilon: float = _EPSILON  # added to the variance
 
     @classmethod
     def untrained(cls, size: int) -> "Statistics":
@@ -53,16 +47,7 @@ class Statistics:
 
     @classmethod
     def read(cls, tensors: Mapping[str, NDArray[Any]], size: int, source: object) -> "Statistics":
-        """Those that `tensors` gave.
-
-        Args:
-            tensors: they may have others beside.
-            size: of what the agent sees.
-            source: where the tensors are from, for messages.
-
-        Raises:
-            DamageError: they aren't there, or of another size, or not statistics.
-        """
+        """Those of `size` numbers that `tensors` gave, among others; the source is for messages."""
         checked = []
         for name, shape in {"mean": (size,), "variance": (size,), "count": ()}.items():
             values = np.asarray(tensors.get(_PREFIX + name))

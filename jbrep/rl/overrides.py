@@ -53,25 +53,24 @@ _FREQUENCY = Annotated[  # of two parts, but msgspec 0.22 crashes on that beside
 ]
 _OWN = {*Hyperparameters.__struct_fields__} - {"algorithm_kwargs", "policy_kwargs"}
 _REFUSED = {  # arguments that are jbrep's own, with the reason
-    "policy": "the policy is always an MlpPolicy",
-    "env": "the environment is made from the task",
-    "seed": "the seed is the run's own",
     "device": "give it by --device",
-    "verbose": "the command line shows the progress",
-    "tensorboard_log": "it is always in the run's folder",
     "policy_kwargs": "set its parts by their own names, such as net_arch or activation_fn",
     "action_noise": "set noise instead",
-    "optimizer_class": "the optimiser is always Adam",
-    "use_rms_prop": "the optimiser is always Adam",
-    "rms_prop_eps": "the optimiser is always Adam",
-    "optimize_memory_usage": "a checkpoint needs whole transitions",
-    "normalize_images": "observations are no images",
-    "features_extractor_class": "observations are flat already",
-    "features_extractor_kwargs": "observations are flat already",
-    "replay_buffer_class": "a checkpoint needs the usual buffer",
-    "replay_buffer_kwargs": "a checkpoint needs the usual buffer",
-    "rollout_buffer_class": "a checkpoint needs the usual buffer",
-    "rollout_buffer_kwargs": "a checkpoint needs the usual buffer",
+    **dict.fromkeys(("policy", "env", "seed", "verbose", "tensorboard_log"), "the run decides it"),
+    **dict.fromkeys(
+        ("optimizer_class", "use_rms_prop", "rms_prop_eps"), "the optimiser is always Adam"
+    ),
+    **dict.fromkeys(
+        ("normalize_images", "features_extractor_class", "features_extractor_kwargs"),
+        "observations are flat already",
+    ),
+    **dict.fromkeys(
+        (
+            *("replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage"),
+            *("rollout_buffer_class", "rollout_buffer_kwargs"),
+        ),
+        "a checkpoint needs the usual buffer",
+    ),
 }
 _NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "use_sde", "net_arch"}
 _SHAPING = "use_sde"  # the argument of algorithms that decides which weights a policy has
@@ -80,11 +79,8 @@ _SHAPING = "use_sde"  # the argument of algorithms that decides which weights a 
 def overridden(algorithm: str, preset: str, overrides: Mapping[str, Any]) -> Hyperparameters:
     """The hyperparameters of a preset with some set differently, all checked.
 
-    Args:
-        algorithm: a key of CLASSES.
-        preset: a key of PRESETS.
-        overrides: by the names of stable-baselines3's parameters, of the algorithm or its policy,
-            or of the other fields of `Hyperparameters`.
+    By the names of stable-baselines3's parameters, of the algorithm or its policy, or of the other
+    fields of `Hyperparameters`.
     """
     base = get_preset(preset, algorithm)
     if not overrides:
@@ -110,7 +106,6 @@ def _overridden(algorithm: str, preset: str, text: str) -> Hyperparameters:
 
 
 def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> Hyperparameters:
-    """Hyperparameters with a setting changed."""
     if name in (of_class := _parameters(algorithm)):
         checked = _typed(name, value, of_class[name])
         return before.replace(algorithm_kwargs={**before.algorithm_kwargs, name: checked})
@@ -200,7 +195,6 @@ def is_off_policy(algorithm: str) -> bool:
 
 
 def _typed(name: str, value: Any, annotation: Any) -> Any:
-    """The value, if a parameter of that name and type may have it."""
     value = _or_none(value) if types.NoneType in typing.get_args(annotation) else value
     return to_plain(converted(value, _allowed(name, annotation), name))
 
@@ -233,17 +227,6 @@ def _check_together(algorithm: str, chosen: Hyperparameters) -> None:
         raise InputError(
             "gradient_steps is 0, with which nothing is learned: it must be above, or -1 for as "
             "many as there were steps"
-        )
-    every = given("target_update_interval")
-    if every and steps and 1 <= steps < every:
-        raise InputError(
-            f"target_update_interval is {every}: it counts the gradient steps of a rollout, "
-            f"so it must be at most gradient_steps, {steps}"
-        )
-    dropped = given("top_quantiles_to_drop_per_net")
-    if dropped and dropped >= (most := chosen.policy_kwargs.get("n_quantiles", 25)):
-        raise InputError(
-            f"top_quantiles_to_drop_per_net is {dropped}: it must be below n_quantiles, {most}"
         )
 
 

@@ -1,22 +1,41 @@
-"""policy.zip, for stable-baselines3 and other programs: written with equal bytes for equal runs."""
+"""policy.zip, for stable-baselines3 and other programs, and such files from elsewhere.
+
+Equal runs have equal bytes.
+"""
 
 import io
 import json
+import pickle
+import warnings
 import zipfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
+import numpy as np
 import safetensors.numpy
 import stable_baselines3
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.save_util import data_to_json
+from stable_baselines3.common.vec_env import VecNormalize
 
-from jbrep.records.document import document_from, parse_json
-from jbrep.rl.agent import statistics_of
-from jbrep.rl.files import ZipHeader
+from jbrep.encoders import find
+from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.shipped import unscaled
+from jbrep.envs.task import Task, check_same
+from jbrep.errors import InputError, refusing
+from jbrep.records.document import Document, document_from, parse_json
+from jbrep.records.record import Sha256
+from jbrep.records.storage import read_file
+from jbrep.rl.agent import action_repeat, is_action_scaled, one_line, statistics_of
+from jbrep.rl.normalization import Statistics
+from jbrep.rl.policy import Trained
+from jbrep.rl.presets import sb3_class
 from jbrep.rl.run_settings import RunSettings
+from jbrep.rl.settings import Name
 
 STATISTICS = "observation_statistics.safetensors"  # by which an agent normalises what it sees
 _HEADER = "trained_on.json"
@@ -33,6 +52,17 @@ _OF_THIS_PROCESS = {  # wall times, and where the environment was: `load` starts
     "ep_success_buffer",
     "start_time",
 }
+
+
+class ZipHeader(Document, frozen=True, kw_only=True):
+    """What policy.zip says beside what stable-baselines3 reads."""
+
+    format = "jbrep policy.zip"
+    format_version = 2
+
+    environment: Task  # of the run
+    encoder: Sha256  # the fingerprint of that through which its agent observes
+    representation: Name  # what tables call that
 
 
 class ZipMetadata(NamedTuple):
@@ -75,21 +105,14 @@ def policy_zip(agent: BaseAlgorithm, settings: RunSettings) -> bytes:
 
 
 def read_metadata(raw: bytes, path: Path) -> ZipMetadata | None:
-    """What a zip file's bytes say; None if jbrep didn't write them. The path is for messages.
-
-    Raises:
-        Exception: of many types, for a file that isn't one.
-    """
+    """What a zip file's bytes say; None if jbrep didn't write them. The path is for messages."""
     members = zipfile.ZipFile(io.BytesIO(raw))
-    names = members.namelist()
-    if _HEADER not in names:
+    if _HEADER not in members.namelist():
         return None
-    header = document_from(
-        parse_json(members.read(_HEADER), path, ZipHeader.format), path, ZipHeader
-    )
-    has_statistics = STATISTICS in names
+    told = parse_json(members.read(_HEADER), path, ZipHeader.format)
+    has_statistics = STATISTICS in members.namelist()
     statistics = safetensors.numpy.load(members.read(STATISTICS)) if has_statistics else {}
-    return ZipMetadata(header, statistics)
+    return ZipMetadata(document_from(told, path, ZipHeader), statistics)
 
 
 def _to_json(data: dict[str, Any]) -> str:
@@ -105,3 +128,149 @@ def _to_bytes(tensors: dict[str, Any]) -> bytes:
     content = io.BytesIO()
     torch.save(tensors, content)
     return content.getvalue()
+
+
+class Zipped(NamedTuple):
+    """A policy from a zip file."""
+
+    trained: Trained
+    note: str  # what the file doesn't tell; empty if it does
+
+
+def load_zip(
+    path: Path,
+    task: Task | None,
+    algorithm: str,
+    encoder: str | None = None,
+    trust: bool = False,
+    vecnormalize: Path | None = None,
+) -> Zipped:
+    """The policy of a stable-baselines3 zip file from elsewhere.
+
+    It sees observations as the environment gives them unless something else is said: by the file,
+    if jbrep wrote it, or by an encoder's file or name and by what `VecNormalize.save` wrote. A
+    file that doesn't say its task needs one. Nothing is read unless it is trusted to run code.
+    """
+    if not trust:
+        raise InputError(
+            f"{path} is not in a folder of jbrep rl: stable-baselines3 files hold pickled Python, "
+            "which runs as code when it is read; add --trust if you know who made it"
+        )
+    raw = read_file(path)
+    agent, told = _loaded(raw, path, algorithm)
+    if told:
+        return Zipped(_as_told(agent, told, path, task, encoder, vecnormalize), "")
+    if task is None:
+        raise InputError(f"{path} doesn't say its task: give the --task that it was trained on")
+    seen = unscaled(task) if encoder is None else find(encoder, task)
+    trained = _checked(agent, task, seen, path)
+    if vecnormalize is None:
+        return Zipped(trained, _note(path))
+    statistics = _statistics(vecnormalize, seen.latent_size)
+    return Zipped(trained._replace(statistics=statistics), "")
+
+
+def _as_told(
+    agent: BaseAlgorithm,
+    told: ZipMetadata,
+    path: Path,
+    task: Task | None,
+    encoder: str | None,
+    vecnormalize: Path | None,
+) -> Trained:
+    """The policy of a file that jbrep wrote, on what it says that the agent observed."""
+    header, statistics = told
+    if task:
+        check_same(task, header.environment, str(path))
+    if vecnormalize:
+        raise InputError(f"{path} has the statistics that it needs: leave out --vecnormalize")
+    try:
+        seen = find(encoder or header.representation, header.environment)
+    except InputError as error:
+        if encoder:
+            raise
+        raise InputError(
+            f"{path} was trained on {header.representation}: give that by --encoder ({error})"
+        ) from None
+    if seen.fingerprint != header.encoder:
+        raise InputError(
+            f"{path} was trained on {header.representation}, which isn't this {seen.name}: give "
+            "that by --encoder"
+        )
+    trained = _checked(agent, header.environment, seen, path)
+    if not statistics:
+        return trained
+    read = Statistics.read(statistics, seen.latent_size, path)
+    return trained._replace(statistics=read)
+
+
+def _checked(agent: BaseAlgorithm, task: Task, seen: BaseEncoder, path: Path) -> Trained:
+    _check_observations(agent.observation_space, seen, path)
+    _check_actions(agent.action_space, task, path)
+    return Trained(agent.policy, task, seen, action_repeat=action_repeat(agent))
+
+
+def _loaded(raw: bytes, path: Path, algorithm: str) -> tuple[BaseAlgorithm, ZipMetadata | None]:
+    kind = sb3_class(algorithm)
+    if not zipfile.is_zipfile(io.BytesIO(raw)):
+        raise InputError(f"{path} isn't a {algorithm} policy: it isn't a zip file")
+    with refusing(f"{path} isn't a {algorithm} policy", told=one_line), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of schedules that another Python pickled
+        # what only training needs: memory, or an environment to be made with
+        unused: dict[str, Any] = {
+            "buffer_size": 1,
+            "replay_buffer_class": None,
+            "replay_buffer_kwargs": {},
+        }
+        agent = kind.load(io.BytesIO(raw), device="cpu", custom_objects=unused)
+        return agent, read_metadata(raw, path)
+
+
+def _check_observations(space: spaces.Space[Any], seen: BaseEncoder, path: Path) -> None:
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise InputError(f"{path} observes {one_line(space)}: it must be a Box of one dimension")
+    if space.shape[0] != seen.latent_size:
+        what = f"{seen.task.name} has" if seen.size == seen.latent_size else f"{seen.name} shows"
+        raise InputError(
+            f"{path} observes {space.shape[0]} numbers, where {what} {seen.latent_size}: give the "
+            "--task that it was trained on, and the --encoder, if there was one"
+        )
+
+
+def _check_actions(space: spaces.Space[Any], task: Task, path: Path) -> None:
+    """Make sure that the policy's actions are in the task's bounds, or scaled to [-1, 1]."""
+    low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
+    if isinstance(space, spaces.Box) and space.shape == low.shape:
+        own = (space.low, low), (space.high, high)
+        if is_action_scaled(space) or all(np.allclose(*each, rtol=1e-5) for each in own):
+            return
+    raise InputError(
+        f"{path} acts in {one_line(space)}, where {task.name} acts from {one_line(low)} to "
+        f"{one_line(high)}: its bounds must be these, or -1 to 1"
+    )
+
+
+def _statistics(path: Path, size: int) -> Statistics | None:
+    """What a VecNormalize normalises observations by; None if it leaves them as they are."""
+    with refusing(f"{path} isn't what VecNormalize.save wrote for this policy", told=one_line):
+        normalizer = pickle.loads(read_file(path))
+        if not isinstance(normalizer, VecNormalize):
+            raise TypeError(f"it holds a {type(normalizer).__name__}")
+        if not normalizer.norm_obs:
+            return None
+        running = cast("RunningMeanStd", normalizer.obs_rms)
+        if not isinstance(running, RunningMeanStd) or running.mean.shape != (size,):
+            raise ValueError("its statistics are of other observations")
+        if not np.isfinite((running.mean, running.var)).all() or running.var.min() < 0:
+            raise ValueError("its statistics aren't finite")
+        limits = float(normalizer.clip_obs), float(normalizer.epsilon)
+        return Statistics(running.mean, running.var, 0.0, *limits)
+
+
+def _note(path: Path) -> str:
+    beside = sorted(each for each in path.parent.glob("*.pkl") if "normal" in each.name.lower())
+    where = str(beside[0]) if len(beside) == 1 else "FILE"
+    return (
+        f"{path} doesn't say what its agent was trained to see: add --vecnormalize {where} if that "
+        "was behind VecNormalize, --encoder full if in JitterbugVecEnv"
+    )

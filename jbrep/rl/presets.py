@@ -11,7 +11,6 @@ from msgspec import Meta
 
 from jbrep.errors import InputError, choose
 from jbrep.records.record import Finite, Record, from_plain
-from jbrep.rl.noise import Noise, NormalNoise, OrnsteinUhlenbeckNoise
 from jbrep.rl.settings import CLASSES, MODERN, PAPER, WIDE
 
 if TYPE_CHECKING:
@@ -29,9 +28,39 @@ _Parts = Annotated[Mapping[str, Layers], Meta(min_length=1, max_length=2)]
 NetArch = Layers | _Parts
 
 
-class _OfAdam(Record, frozen=True):
-    """Arguments of Adam, but for its learning rate."""
+_Sigma = Annotated[float, Meta(ge=0, le=1e6)]  # standard deviation
 
+
+class NormalNoise(Record, frozen=True, tag_field="kind", tag="normal"):
+    """Independent Gaussian noise on each number of an action scaled to [-1, 1], with mean 0."""
+
+    sigma: _Sigma
+
+
+class OrnsteinUhlenbeckNoise(Record, frozen=True, tag_field="kind", tag="ornstein-uhlenbeck"):
+    """Noise that drifts back to its mean, starting from 0 in each episode.
+
+    stable-baselines3 takes a step for 0.01 units of time: with a larger theta it would swing.
+    """
+
+    mean: Annotated[float, Meta(ge=-1e6, le=1e6)]
+    sigma: _Sigma
+    theta: Annotated[float, Meta(ge=0, le=100)]
+
+
+class ColouredNoise(Record, frozen=True, tag_field="kind", tag="coloured"):
+    """Noise with a power in proportion to 1 / frequency^beta, drawn for an episode at once.
+
+    It is white with a beta of 0, pink with 1, which Eberhard et al. (2023, "Pink noise is all you
+    need") recommend for many tasks, and red with 2. Numbers of an action are independent; each has
+    the standard deviation sigma over an episode.
+    """
+
+    beta: Annotated[float, Meta(ge=0, le=2)] = 1.0
+    sigma: _Sigma = 0.2
+
+
+class _OfAdam(Record, frozen=True):
     betas: tuple[Finite, Finite] | None = None
     eps: Finite | None = None
     weight_decay: Finite | None = None
@@ -41,30 +70,24 @@ class Hyperparameters(Record, frozen=True):
     """Those of an algorithm; what isn't named keeps stable-baselines3's default.
 
     All fields but the arguments of stable-baselines3's classes can be set by their names, too.
-
-    Attributes:
-        net_arch: units of the hidden layers of actor and critic, or of each by its name: pi and
-            qf, on policy pi and vf.
-        algorithm_kwargs: arguments of the algorithm's class; "linear:0.1" is a schedule from 0.1
-            to 0.
-        num_envs: lanes stepped together.
-        noise: on actions scaled to [-1, 1].
-        optimizer_kwargs: arguments of Adam.
-        policy_kwargs: arguments of the policy's class; activation_fn by its name.
-        normalize: whether the agent sees its input by the running mean and variance.
-        action_repeat: control steps for which each action is held, which are one step of the agent;
-            what else counts steps here counts the agent's.
     """
 
+    # units of the hidden layers of actor and critic, or of each by its name: pi and qf, on policy
+    # pi and vf
     net_arch: NetArch
+    # arguments of the algorithm's class; "linear:0.1" is a schedule from 0.1 to 0
     algorithm_kwargs: Mapping[str, Any]
-    num_envs: Annotated[int, Meta(ge=1, le=MAX_ENVS)] = 1
-    noise: Noise | None = None
-    optimizer_kwargs: Mapping[str, Any] = {}
+    num_envs: Annotated[int, Meta(ge=1, le=MAX_ENVS)] = 1  # lanes stepped together
+    # on actions scaled to [-1, 1]
+    noise: NormalNoise | OrnsteinUhlenbeckNoise | ColouredNoise | None = None
+    optimizer_kwargs: Mapping[str, Any] = {}  # arguments of Adam
+    # arguments of the policy's class; activation_fn by its name
     policy_kwargs: Mapping[str, Any] = msgspec.field(
         default_factory=lambda: {"activation_fn": "relu"}
     )
-    normalize: bool = False
+    normalize: bool = False  # whether the agent sees its input by the running mean and variance
+    # control steps for which each action is held, which are one step of the agent; what else counts
+    # steps here counts the agent's
     action_repeat: Annotated[int, Meta(ge=1, le=MAX_REPEAT)] = 1
 
     def check(self) -> None:

@@ -1,6 +1,9 @@
-"""What a training run is: task, learner, representation, seed, and how it is trained."""
+"""What a training run is: task, learner, representation, seed, how it is trained, how long."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, closing
+from math import gcd
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +12,13 @@ from msgspec import UNSET
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.description import as_task
+from jbrep.envs.lanes import lanes_at_once
 from jbrep.envs.names import is_code
 from jbrep.envs.task import Task
 from jbrep.records.record import Sha256, to_plain
+from jbrep.rl.agent import evaluate, make_agent, make_env
 from jbrep.rl.learner import Learner
+from jbrep.rl.overrides import is_off_policy
 from jbrep.rl.policy import policy_to_begin_with
 from jbrep.rl.presets import usual_preset
 from jbrep.rl.run_settings import RunSettings
@@ -22,33 +28,24 @@ from jbrep.training.trainer import get_device, single_torch_thread
 # where a run doesn't say: evaluations before the last, steps between them, and how many times as
 # many episodes the last has
 _EVALUATIONS, _APART, _FINAL = 10, 10_000, 10
+_TRIAL = 300  # steps from which the time of a run is estimated
 
 
 class Run(TrainingSettings, frozen=True, kw_only=True):
-    """What to train.
+    """What to train."""
 
-    Attributes:
-        task: what is learned.
-        learner: the algorithm with its hyperparameters.
-        encoder: through which the agent observes: a name or file, code, or a user's own encoder,
-            as `jbrep.encoders.find` takes it.
-        seed: of agent and episodes.
-        representation: what tables call it that the agent observes; the encoder's own name by
-            default.
-        encoder_seed: that the encoder was made with, if each run has its own.
-        begin_from: the folder of a finished run, whose policy this one begins with.
-        registration: SHA-256 of that of its study, if that is registered.
-        one_robot: whether there is one instance of the environment, as of a robot that exists once.
-    """
-
-    task: Task
-    learner: Learner
+    task: Task  # what is learned
+    learner: Learner  # the algorithm with its hyperparameters
+    # through which the agent observes: a name or file, code, or a user's own encoder, as
+    # `jbrep.encoders.find` takes it
     encoder: Any = FULL
-    seed: Seed = 0
+    seed: Seed = 0  # of agent and episodes
+    # what tables call it that the agent observes; the encoder's own name by default
     representation: Name | None = None
-    encoder_seed: Seed | None = None
-    begin_from: str = ""
-    registration: Sha256 | None = None
+    encoder_seed: Seed | None = None  # that the encoder was made with, if each run has its own
+    begin_from: str = ""  # the folder of a finished run, whose policy this one begins with
+    registration: Sha256 | None = None  # SHA-256 of that of its study, if that is registered
+    # whether there is one instance of the environment, as of a robot that exists once
     one_robot: bool = False
 
     @classmethod
@@ -60,15 +57,10 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
         overrides: Mapping[str, Any] = {},
         **others: Any,
     ) -> "Run":
-        """A run of a task with an algorithm.
+        """A run of a task with an algorithm of stable-baselines3's, such as sac.
 
-        Args:
-            task: itself, or its name.
-            algorithm: one of stable-baselines3's, such as sac.
-            preset: its hyperparameters: paper, modern, wide, or a TOML file; if empty, that which
-                serves a newcomer best, wide or modern.
-            overrides: hyperparameters that are set differently, as with --set.
-            others: fields of a run.
+        The preset is paper, modern, wide, or a TOML file; if empty, that which serves a newcomer
+        best. Overrides are hyperparameters that are set differently; others are fields of a run.
         """
         learner = Learner.given(algorithm, preset or usual_preset(algorithm), overrides)
         return cls(task=as_task(task), learner=learner, **others)
@@ -113,3 +105,44 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
             return settings
         sha256 = policy_to_begin_with(Path(self.begin_from), settings, encoder.latent_size)
         return settings.replace(begin_from=sha256)
+
+
+def estimate(run: Run) -> float:
+    """Seconds that a run takes on one core of this machine with nothing else running."""
+    if is_off_policy(run.learner.algorithm):
+        run = run.replace(learner=run.learner.overridden(_at_once(run)))
+    encoder = run.find_encoder()
+    settings = run.settings(encoder)
+    chosen, episodes = settings.hyperparameters, run.evaluation_episodes
+    made = make_env(
+        run.task,
+        chosen.num_envs,
+        0,
+        encoder,
+        normalize=chosen.normalize,
+        action_repeat=chosen.action_repeat,
+    )
+    with single_torch_thread(), closing(made) as env, ExitStack() as opened:
+        agent = make_agent(settings.algorithm, chosen, env, 0, settings.episode_steps)
+        learning = _seconds(lambda: agent.learn(_TRIAL))  # whole rollouts, so at least one
+        lanes = opened.enter_context(lanes_at_once(run.task, episodes, 1, 0))
+        evaluation = _seconds(lambda: evaluate(agent, lanes, encoder, episodes))
+        taken = settings.control_steps(agent.num_timesteps)
+    count = run.steps // settings.evaluate_every + settings.final_episodes / episodes
+    return run.steps * learning / taken + count * evaluation
+
+
+def _at_once(run: Run) -> dict[str, int]:
+    """Settings with gradient steps from the first rollout on, in rollouts as short as can be."""
+    used = run.learner.hyperparameters.algorithm_kwargs
+    every, many = used.get("train_freq"), used.get("gradient_steps")
+    if type(every) is not int or type(many) is not int or many < 1:
+        return {"learning_starts": 0}
+    every, many = every // gcd(every, many), many // gcd(every, many)
+    return {"learning_starts": 0, "train_freq": every, "gradient_steps": many}
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    started = time.perf_counter()
+    work()
+    return time.perf_counter() - started

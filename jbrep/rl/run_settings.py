@@ -7,7 +7,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from jbrep.envs.task import Id, Task
-from jbrep.errors import InputError, differences
+from jbrep.errors import differences
 from jbrep.records.record import Sha256, pattern, to_plain
 from jbrep.rl.presets import LINEAR, Hyperparameters, learns_from
 from jbrep.rl.settings import (
@@ -40,11 +40,6 @@ class SharedSettings(TrainingSettings, frozen=True, kw_only=True):
     final_episodes: Episodes
     device: Literal["cpu", "cuda"]
 
-    def check(self) -> None:
-        super().check()
-        if self.environment.name != self.task:
-            raise InputError(f"task is {self.task}, but environment is of {self.environment.name}")
-
     @property
     def label(self) -> str:
         """What runs of other seeds have, too: TASK/LEARNER/REPRESENTATION."""
@@ -52,22 +47,16 @@ class SharedSettings(TrainingSettings, frozen=True, kw_only=True):
 
 
 class RunSettings(SharedSettings, frozen=True, kw_only=True):
-    """All settings of a run; together with versions they decide every number, on one kind of CPU.
-
-    Attributes:
-        encoder: its fingerprint.
-        encoder_seed: that the encoder was made with, if each run has its own.
-        begin_from: SHA-256 of the policy of another run that this one begins with, if it does.
-        registration: SHA-256 of that of its study, if that is registered.
-        one_robot: whether it was trained and evaluated in one instance of its environment;
-            evaluations then wait for the end of an episode of training.
-    """
+    """All of a run; together with versions they decide every number, on one kind of CPU."""
 
     seed: Seed
-    encoder: Sha256
-    encoder_seed: Seed | None
+    encoder: Sha256  # its fingerprint
+    encoder_seed: Seed | None  # that the encoder was made with, if each run has its own
+    # SHA-256 of the policy of another run that this one begins with, if it does
     begin_from: Sha256 | None = msgspec.field(name="from")
-    registration: Sha256 | None
+    registration: Sha256 | None  # SHA-256 of that of its study, if that is registered
+    # whether it was trained and evaluated in one instance of its environment; evaluations then wait
+    # for the end of an episode of training
     one_robot: Literal[True] | UnsetType = UNSET
 
     @property

@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
@@ -14,8 +13,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
-from torch.utils.tensorboard import SummaryWriter
+from stable_baselines3.common.logger import KVWriter
 
 from jbrep.encoders import Encoder, save
 from jbrep.encoders.base import BaseEncoder
@@ -29,9 +27,9 @@ from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, make_folder, read_file, write_whole
 from jbrep.records.tables import write_csv, write_rows
 from jbrep.rl.agent import (
-    Evaluator,
     acting,
     action_repeat,
+    evaluate,
     make_agent,
     make_env,
     restore_statistics,
@@ -67,13 +65,13 @@ from jbrep.rl.files import (
     RunRecord,
     read_run,
 )
-from jbrep.rl.history import History
+from jbrep.rl.history import ControlStepsLogger, History, Scalars
+from jbrep.rl.policy import Trained, fill_whole, pack_whole
 from jbrep.rl.policy_file import read
 from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
 from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_LINE
-from jbrep.rl.trained import Trained, fill_whole, pack_whole
 from jbrep.text import printable
 from jbrep.training.trainer import single_thread
 
@@ -85,31 +83,27 @@ class DivergedError(ArithmeticError):
 
 
 class Session(NamedTuple):
-    """What goes on around training.
+    """What goes on around training."""
 
-    Attributes:
-        watch: called with what a run has recorded and its steps so far.
-        save_every: seconds between checkpoints, at least.
-        stop: asked before each rollout; once it is true, a checkpoint is written and training ends.
-        writers: of stable-baselines3's logger, that get what TensorBoard gets.
-        keep_checkpoint: whether a run that has ended keeps a checkpoint, from which it can go on.
-        threads: that step environments.
-        retries: how often in a row an environment that fails is made anew.
-    """
-
+    # called with what a run has recorded and its steps so far
     watch: Callable[[History, int], None] = lambda history, step: None
-    save_every: float = 60
+    save_every: float = 60  # seconds between checkpoints, at least
+    # asked before each rollout; once it is true, a checkpoint is written and training ends
     stop: Callable[[], bool] = lambda: False
+    # of stable-baselines3's logger, that get what TensorBoard gets
     writers: Sequence[KVWriter] = ()
+    # whether a run that has ended keeps a checkpoint, from which it can go on
     keep_checkpoint: bool = False
-    threads: int = 1
-    retries: int = 0
+    threads: int = 1  # that step environments
+    retries: int = 0  # how often in a row an environment that fails is made anew
 
 
 _ALONE = Session()
 
 
-def train(run: Run, folder: Path, session: Session = _ALONE) -> RunRecord:
+def train(
+    run: Run, folder: Path, session: Session = _ALONE, encoder: BaseEncoder | None = None
+) -> RunRecord:
     """Train an agent and write its folder, unless the run has ended already.
 
     A run that was killed or stopped resumes from its checkpoint, to the same bits.
@@ -118,6 +112,7 @@ def train(run: Run, folder: Path, session: Session = _ALONE) -> RunRecord:
         run: what to train.
         folder: for this run alone.
         session: what goes on around training.
+        encoder: what `run.find_encoder` returns, if it is known.
 
     Returns:
         The contents of run.json; where a run that went on with more steps failed, why: its files
@@ -126,7 +121,7 @@ def train(run: Run, folder: Path, session: Session = _ALONE) -> RunRecord:
     Raises:
         StoppedError: the session's `stop` was true.
     """
-    encoder = run.find_encoder()
+    encoder = encoder or run.find_encoder()
     if ended := standing_of(run, folder, encoder).ended:
         return ended
     make_folder(folder, OWN)
@@ -164,22 +159,14 @@ def packages() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class _Job:
-    """A run that is trained now, in its folder."""
-
     run: Run
     folder: Path
     session: Session
     encoder: BaseEncoder
     settings: RunSettings
 
-    @cached_property
-    def versions(self) -> dict[str, str]:
-        """Of the packages that, with the settings, decide every number."""
-        return versions_of(self.run)
-
 
 def _train(job: _Job, resumes: bool) -> RunRecord:
-    """Bring a run to its end, from its checkpoint or from its start."""
     checkpoint = Checkpoint.read(job.folder) if resumes else None
     history = checkpoint.header.history if checkpoint else History()
     if isinstance(job.encoder, Encoder):
@@ -188,7 +175,7 @@ def _train(job: _Job, resumes: bool) -> RunRecord:
         if job.settings.begin_from:
             _begin(agent, job, is_new=not resumes)
         scalars = Scalars(job.folder / "tensorboard", history.first_step)
-        agent.set_logger(_Logger(job.settings, [scalars, *job.session.writers]))
+        agent.set_logger(ControlStepsLogger(job.settings, [scalars, *job.session.writers]))
         with closing(_Progress(job, history, checkpoint)) as progress:
             failed = _learn(agent, job.settings.agent_steps, progress)
         return _end(agent, job, history, failed)
@@ -196,7 +183,6 @@ def _train(job: _Job, resumes: bool) -> RunRecord:
 
 @contextmanager
 def _agent(job: _Job) -> Iterator[BaseAlgorithm]:
-    """The untrained agent, in its environments."""
     settings, seed = job.settings, training_seed(job.run.seed)
     chosen = settings.hyperparameters
     made = make_env(
@@ -246,38 +232,30 @@ class _Progress(BaseCallback):
     """Records an agent's training, evaluates its policy, and keeps its checkpoint.
 
     The policy is evaluated before the first step, after the last, and at intervals in between.
-    Checkpoints are written between rollouts, where an agent's state is complete.
-
-    Args:
-        job: what is trained.
-        history: to record in.
-        checkpoint: to go on from, if there is one.
-
-    Raises:
-        StoppedError: (in training) the session is to stop; the checkpoint is written.
+    Checkpoints are written between rollouts, where an agent's state is complete; then a session
+    that is to stop raises StoppedError.
     """
 
     def __init__(self, job: _Job, history: History, checkpoint: Checkpoint | None):
         super().__init__()
         self._job, self._history, self._settings = job, history, job.settings
         self._checkpoint, self._draws = checkpoint, dict[str, Any]()
-        self._saver = Saver(job.folder, job.settings, job.versions, job.session.save_every)
-        self._evaluator: Evaluator | None = None
+        self._saver = Saver(job.folder, job.settings, versions_of(job.run), job.session.save_every)
+        self._lanes: Lanes | None = None  # of evaluations
 
     def close(self) -> None:
         """Free what the evaluations hold."""
-        if self._evaluator:
-            self._evaluator.close()
+        if self._lanes:
+            self._lanes.close()
 
     def _on_training_start(self) -> None:
         run, session = self._job.run, self._job.session
         episodes = run.evaluation_episodes
         if run.one_robot:
-            lanes: Lanes = vec_env(self.model).lanes
+            self._lanes = vec_env(self.model).lanes
         else:
             threads = min(session.threads, episodes)
-            lanes = lanes_at_once(run.task, episodes, threads, session.retries)
-        self._evaluator = Evaluator(lanes, self._job.encoder, episodes)
+            self._lanes = lanes_at_once(run.task, episodes, threads, session.retries)
         if self._checkpoint:
             self._draws = dict(self._checkpoint.tensors)
             self._checkpoint.restore(self.model)
@@ -323,7 +301,7 @@ class _Progress(BaseCallback):
         Args:
             observed: its first observation as the agent is to see it, (1, l).
         """
-        self._play()
+        self._play(self._settings.evaluation_episodes)
         if self._job.run.one_robot:
             first: Any = vec_env(self.model).restart()
             if normalizer := self.model.get_vec_normalize_env():
@@ -333,10 +311,10 @@ class _Progress(BaseCallback):
                 first = normalizer.normalize_obs(first)
             observed[:] = first
 
-    def _play(self, episodes: int | None = None) -> None:
-        """Play the deterministic policy, and record and log the returns and infos."""
-        assert self._evaluator is not None
-        outcome, logger = self._evaluator.outcome(self.model, episodes), self.model.logger
+    def _play(self, episodes: int) -> None:
+        assert self._lanes is not None
+        outcome = evaluate(self.model, self._lanes, self._job.encoder, episodes)
+        logger = self.model.logger
         self._history.add(self._step, outcome)
         logger.record("evaluation/mean_return", self._history.means[-1])
         for name, values in by_name(outcome.numbers).items():
@@ -359,7 +337,6 @@ class _Progress(BaseCallback):
 
     @property
     def _step(self) -> int:
-        """Training steps so far, in control steps."""
         return self._settings.control_steps(self.model.num_timesteps)
 
 
@@ -418,7 +395,7 @@ def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | 
         latent_size=job.encoder.latent_size,
         steps=steps,
         seconds=history.seconds,
-        versions=job.versions,
+        versions=versions_of(job.run),
         commits=commits(),
         cpu=cpu(),
         tables=tables,
@@ -430,7 +407,6 @@ def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | 
 
 
 def _write_tables(folder: Path, history: History) -> dict[str, str]:
-    """Write the run's tables; their SHA-256 by their names."""
     tables = {
         EPISODES: write_rows(folder / EPISODES, history.episodes, Episode),
         EVALUATIONS: write_rows(folder / EVALUATIONS, history.evaluations, Evaluation),
@@ -438,22 +414,3 @@ def _write_tables(folder: Path, history: History) -> dict[str, str]:
     if history.infos:
         tables[INFOS] = write_csv(folder / INFOS, Info._fields, history.infos)
     return tables
-
-
-class _Logger(Logger):
-    """stable-baselines3's, that tells writers control steps instead of its agent's."""
-
-    def __init__(self, settings: RunSettings, writers: list[KVWriter]):
-        super().__init__(None, writers)
-        self._settings = settings
-
-    def dump(self, step: int = 0) -> None:
-        super().dump(self._settings.control_steps(step))
-
-
-class Scalars(TensorBoardOutputFormat):
-    """TensorBoard's file after a step; later ones of an earlier process are hidden."""
-
-    def __init__(self, folder: Path, step: int):
-        self.writer = SummaryWriter(str(folder), purge_step=step + 1)
-        self._is_closed = False

@@ -120,7 +120,6 @@ def tune(
 
 
 def _claim(path: Path, search: Search) -> None:
-    """Write what is searched in a folder, which must be the same from then on."""
     if not exists(path):
         search.write(path)
         return
@@ -145,7 +144,6 @@ def _overrides(parameters: Mapping[str, Any]) -> dict[str, Any]:
 def _trial(
     study: optuna.Study, number: int, run: Run, seeds: int, folder: Path, stop: Callable[[], bool]
 ) -> Trial:
-    """A trial, whose runs are trained unless they have ended."""
     seed = int(np.random.SeedSequence([run.seed, number]).generate_state(1)[0])
     study.sampler = optuna.samplers.TPESampler(seed=seed)  # whatever was drawn before
     asked = study.ask(_space(run))
@@ -158,7 +156,6 @@ def _trial(
 
 
 def _score(run: Run, seeds: range, folder: Path, stop: Callable[[], bool]) -> float | None:
-    """The mean return of the last evaluations of a trial's runs; None if one failed."""
     last: list[float] = []
     for seed in seeds:
         own = folder / f"seed-{seed}"

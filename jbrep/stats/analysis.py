@@ -1,23 +1,67 @@
 """A whole study: results of every representation, comparisons with the baseline, verdicts."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import levene, rankdata
 
-from jbrep.stats.aggregates import Aggregate, aggregates
 from jbrep.stats.bootstrap import Array, Interval, without_nan
-from jbrep.stats.comparison import Comparison, compare
-from jbrep.stats.curves import compared
-from jbrep.stats.intervals import LEVEL, mean_within
-from jbrep.stats.labels import YES, RepresentationResult, describe
+from jbrep.stats.claims import FASTER, LESS_VARIABLE
+from jbrep.stats.curves import Compared, compared, iqm
+from jbrep.stats.intervals import (
+    FEWEST_RUNS,
+    LEVEL,
+    UNDEFINED,
+    Bounds,
+    constant,
+    mean_within,
+    percentile,
+    share_of_gain,
+    unless_few,
+    variance_ratio,
+)
+from jbrep.stats.labels import RepresentationResult, describe, median
+from jbrep.stats.pairs import Pair, paired
 from jbrep.stats.rules import Planned, Verdict
 from jbrep.stats.runs import Group, RunCurve, evaluated_run, groups
-from jbrep.stats.scale import SOLVED, Ends, best_blind, scale_of
+from jbrep.stats.scale import STEPS_TO, Ends, best_blind, scale_of
 
 References = Mapping[str, Mapping[str, Sequence[float]]]  # returns by task and policy
+SCORES = np.linspace(0, 1.2, 61)  # at which profiles are evaluated
+_PAIRED = (
+    *("final_return_difference", "score_difference", "mean_return_difference"),
+    *("share_of_gain", "steps_later", "spread_ratio"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A representation against the baseline."""
+
+    representation: str
+    # differences, ratios and the probability of improvement, by name, each with its 95 % interval
+    numbers: Mapping[str, Interval]
+    brown_forsythe_p: float  # of equal variances of final returns; NaN where it is undefined
+    shared: int  # seeds of both, over which differences are taken
+    by_encoder: bool  # whether that is over encoders
+
+
+@dataclass(frozen=True, eq=False)
+class Aggregate:
+    """A representation's runs on several tasks, with one algorithm."""
+
+    algorithm: str
+    representation: str
+    tasks: tuple[str, ...]  # their names; those without a reference policy are left out
+    runs: int  # on each task: the first of those with more
+    iqm: Interval  # interquartile mean of scores, with its 95 % interval
+    optimality_gap: Interval  # mean of what scores lack to 1, with its 95 % interval
+    scores: Array  # where the profile is evaluated, (k,)
+    # the share of runs with a score above each of these, averaged over tasks, (k,)
+    profile: Interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,24 +88,9 @@ class GroupAnalysis:
     verdicts: tuple[Verdict, ...]  # on the claims that were registered
 
     @property
-    def solved(self) -> float:
-        """The return from which on the task counts as solved; NaN if unknown."""
-        return self.thresholds[SOLVED]
-
-    @property
     def best_policy(self) -> str | None:
         """The best of the policies that don't look; None if there is none."""
         return best_blind({policy: mean.value for policy, mean in self.references.items()})
-
-    @property
-    def compared(self) -> tuple[Comparison, ...]:
-        """What can be compared with the baseline: nothing if that didn't learn."""
-        return self.comparisons if self.labels[0].learnt == YES else ()
-
-    @property
-    def name(self) -> str:
-        """Task and algorithm, for titles."""
-        return f"{self.task}, {self.algorithm}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +117,8 @@ def analyse(
 ) -> Analysis:
     """All numbers and verdicts of a study; they don't depend on the order of its runs.
 
-    Args:
-        runs: every run of the study.
-        planned: what the runs are compared with, and the claims that get verdicts; by default the
-            full observation, and none.
-        seed: of all resampling.
-        references: returns of policies that don't learn, by task and policy.
+    By default these are compared with the full observation, and no claim gets a verdict. References
+    are returns of policies that don't learn, by task and policy.
     """
     planned = planned or Planned()
     by_group, played = groups(runs, planned.rules.baseline), references or {}
@@ -163,6 +188,120 @@ def _scores(groups: Sequence[GroupAnalysis]) -> dict[str, dict[str, dict[str, Ar
 
 def _or_nan(value: float | None) -> float:
     return np.nan if value is None else float(value)
+
+
+def compare(
+    label: RepresentationResult, baseline: RepresentationResult, known: Compared, seed: int
+) -> Comparison:
+    """A representation against the baseline of the same task and algorithm."""
+    pairs = {name: (label.by_run[name], baseline.by_run[name]) for name in label.by_run}
+    finals, runs = pairs["final_return"], (len(label.seeds), len(baseline.seeds))
+    found = paired(known, label.representation, baseline.representation)
+    numbers = _differences(found, seed) if found else dict.fromkeys(_PAIRED, UNDEFINED)
+    numbers["variance_ratio"] = unless_few(variance_ratio(*finals), *runs)
+    for name, statistic in (
+        ("variance_ratio_bootstrap", _ratio_of_variances),
+        ("probability_of_improvement", probability_of_improvement),
+    ):
+        numbers[name] = percentile(statistic, *finals, seed=seed)
+    for name in STEPS_TO:
+        numbers[f"{name}_ratio"] = percentile(_ratio_of_medians, *pairs[name], seed=seed)
+    return Comparison(
+        representation=label.representation,
+        numbers=numbers,
+        brown_forsythe_p=_brown_forsythe(*finals),
+        shared=found.runs if found else 0,
+        by_encoder=found is not None and found.by_encoder,
+    )
+
+
+def _differences(pair: Pair, seed: int) -> dict[str, Interval]:
+    """What is compared unit by unit; shares of gains and ratios only where the baseline learned."""
+    x, y = pair.x, pair.y
+    score = pair.ends.score(x.final) - pair.ends.score(y.final)
+    every = (
+        mean_within(x.final - y.final, Bounds(), LEVEL),
+        mean_within(score, Bounds(), LEVEL),
+        mean_within(x.mean - y.mean, Bounds(), LEVEL),
+        *(
+            (
+                share_of_gain(x.final, y.final, pair.ends.blind, LEVEL),
+                FASTER.estimate(pair, LEVEL, seed),
+                LESS_VARIABLE.estimate(pair, LEVEL, seed),
+            )
+            if pair.y_learns
+            else [UNDEFINED] * 3
+        ),
+    )
+    return {n: unless_few(e, pair.units) for n, e in zip(_PAIRED, every, strict=True)}
+
+
+def probability_of_improvement(x: Array, y: Array) -> Array:
+    """The share of pairs in which a run of x (..., n) beats one of y (..., m); ties count half.
+
+    Mann and Whitney's statistic, as in Agarwal et al. 2021.
+    """
+    n, m = x.shape[-1], y.shape[-1]
+    ranks = rankdata(np.concatenate((x, y), axis=-1), axis=-1)[..., :n]
+    return (ranks.sum(axis=-1) - n * (n + 1) / 2) / (n * m)
+
+
+def _ratio_of_variances(x: Array, y: Array) -> Array:
+    return x.var(axis=-1, ddof=1) / y.var(axis=-1, ddof=1)
+
+
+def _ratio_of_medians(x: Array, y: Array) -> Array:
+    return median(x) / median(y)
+
+
+def _brown_forsythe(x: Array, y: Array) -> float:
+    if constant(x) or constant(y) or min(len(x), len(y)) < FEWEST_RUNS:
+        return np.nan
+    return float(levene(x, y, center="median").pvalue)
+
+
+def aggregates(
+    scores: Mapping[str, Mapping[str, Mapping[str, Array]]], seed: int
+) -> Iterator[Aggregate]:
+    """The results of each algorithm and representation that has runs on two tasks or more.
+
+    After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical
+    Precipice", with runs resampled within each task. Scores are by algorithm, task and
+    representation, (runs,) each.
+    """
+    for algorithm, by_task in scores.items():
+        names = dict.fromkeys(name for by_name in by_task.values() for name in by_name)
+        for name in names if len(by_task) > 1 else ():
+            if all(name in by_name for by_name in by_task.values()):
+                own = [by_name[name] for by_name in by_task.values()]
+                yield _aggregate(algorithm, name, tuple(by_task), own, seed)
+
+
+def _aggregate(
+    algorithm: str, name: str, tasks: tuple[str, ...], scores: Sequence[Array], seed: int
+) -> Aggregate:
+    runs = min(map(len, scores))
+
+    def interval(statistic: Callable[[Array], Array]) -> Interval:
+        def of_samples(*samples: Array) -> Array:
+            return statistic(np.concatenate(samples, axis=-1))
+
+        return percentile(of_samples, *(each[:runs] for each in scores), seed=seed)
+
+    return Aggregate(
+        algorithm=algorithm,
+        representation=name,
+        tasks=tasks,
+        runs=runs,
+        iqm=interval(iqm),
+        optimality_gap=interval(lambda each: (1 - np.minimum(each, 1)).mean(axis=-1)),
+        scores=SCORES,
+        profile=interval(_shares_above),
+    )
+
+
+def _shares_above(scores: Array) -> Array:
+    return (scores > SCORES.reshape(-1, *[1] * scores.ndim)).mean(axis=-1)
 
 
 def to_plain(value: Any) -> Any:

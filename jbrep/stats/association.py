@@ -1,65 +1,13 @@
-"""Do diagnostics predict learning? Final returns against what was measured of the codes."""
+"""Rank correlations over codes, for whether diagnostics predict learning."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import UNDEFINED, percentile
 
 _FEWEST = 5  # pairs, or families for an interval: with fewer, ranks agree by chance too often
-Diagnosed = Mapping[tuple[str, str], Mapping[str, float | None]]  # by task and representation
-Families = Mapping[tuple[str, str], str]  # likewise: how a code is made
-
-
-class Diagnostic(NamedTuple):
-    """A number of an encoder."""
-
-    name: str
-    words: str  # what it is
-    better: int  # 1 if higher is better, -1 if lower is
-
-
-class Association(NamedTuple):
-    """A diagnostic of the codes of one task, and what one algorithm learned from them."""
-
-    group: GroupAnalysis
-    diagnostic: Diagnostic
-    representations: tuple[str, ...]  # that it is known of, the full observation among them
-    values: Array  # of the diagnostic, (n,)
-    returns: Array  # mean final return over runs, (n,)
-    families: tuple[str, ...]  # of the codes, by how they are made, (n,)
-    correlation: Interval  # of ranks; positive if the better value goes with the higher return
-
-
-def associations(
-    groups: Iterable[GroupAnalysis],
-    diagnosed: Diagnosed,
-    diagnostics: Sequence[Diagnostic],
-    families: Families,
-    seed: int = 0,
-) -> list[Association]:
-    """Each diagnostic with the final returns of each group, where both are known of some code."""
-    result = []
-    for group in groups:
-        returns = {
-            label.representation: float(label.numbers["final_return_mean"].value)
-            for label in group.labels
-        }
-        for each in diagnostics:
-            known = {
-                name: value
-                for name in returns
-                if (value := diagnosed.get((group.task, name), {}).get(each.name)) is not None
-            }
-            if known:
-                x, y = np.array(list(known.values())), np.array([returns[name] for name in known])
-                kin = tuple(families[group.task, name] for name in known)
-                correlation = rank_correlation(each.better * x, y, kin, seed)
-                result.append(Association(group, each, tuple(known), x, y, kin, correlation))
-    return result
 
 
 def rank_correlation(x: Array, y: Array, families: Sequence[str], seed: int = 0) -> Interval:

@@ -62,12 +62,9 @@ def _weights(count: int) -> Array:
 
 
 def by_episode(values: NDArray[Any], episode: NDArray[np.int64], count: int) -> Array:
-    """Sums of rows (n, ...) over the rows of each episode, (count, ...).
+    """Sums of rows (n, ...) over the rows of each episode, (count, ...); zero of one without any.
 
-    Args:
-        values: a row for each row of data.
-        episode: the number of each row's episode, (n,), in ascending order.
-        count: the number of episodes; the sums of one without rows are zero.
+    The numbers of their episodes, (n,), ascend.
     """
     sums = np.zeros((count, *values.shape[1:]))
     if len(values):

@@ -116,7 +116,6 @@ def _end_on_all_starts(group: Mapping[str, Sequence[RunCurve]], grid: Array) -> 
 
 
 def _end(run: RunCurve, curve: Array) -> float:
-    """The mean of a run's last evaluation; its failure_return if it failed."""
     if run.failed_at is not None and run.failure_return is not None:
         return run.failure_return
     return float(curve[-1] if run.final is None else run.final.mean())

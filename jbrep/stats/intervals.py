@@ -161,7 +161,6 @@ def _moments(values: Array) -> tuple[Array, Array]:
 
 
 def _log_error(kurtosis: Array, n: int) -> Array:
-    """The squared error of the log of a variance of n values."""
     return (kurtosis - (n - 3) / n) / (n - 1)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binomtest, iqr, median_abs_deviation
+from scipy.stats import binomtest, chi2, f, iqr, median_abs_deviation
 
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.curves import Curve, bands, final_return, iqm, mean_return, rise, rises, steps_to
@@ -18,7 +18,6 @@ from jbrep.stats.intervals import (
     surely_above,
     unless_few,
 )
-from jbrep.stats.nested import components
 from jbrep.stats.pairs import FEWEST_UNITS, Units, linked_units
 from jbrep.stats.runs import RunCurve
 from jbrep.stats.scale import STEPS_TO, Scale
@@ -28,6 +27,7 @@ REACHED = {name: name.replace("steps_to", "reached") for name in STEPS_TO}
 _TAIL = 0.25  # of runs: a smaller part of so few would be the worst run alone
 # of the variance of final returns, where each of several encoders has several runs
 COMPONENTS = ("encoder_variance", "run_variance", "encoder_variance_ratio")
+_TAILS = (1 + LEVEL) / 2, (1 - LEVEL) / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +104,56 @@ def profile(final_return: Array, returns: Array, seed: int) -> Interval:
 
 
 def _components(encoders: Units, final: Array) -> dict[str, Interval]:
-    """The variance of encoders and of runs, where each encoder has as many runs, at least two."""
     counts = {len(runs) for runs in encoders}
     known = len(encoders) > 1 and len(counts) == 1 and counts != {1}
-    found = components(final[np.array(encoders)]) if known else [UNDEFINED] * 3
+    found = components(final[np.array(encoders)]) if known else (UNDEFINED,) * 3
     return dict(zip(COMPONENTS, found, strict=True))
+
+
+def components(returns: Array) -> tuple[Interval, Interval, Interval]:
+    """How much of the spread of returns (e, r), at least two each, is of e encoders and r runs.
+
+    The return of a run is a mean plus what its encoder adds plus what the run adds, each with a
+    variance of its own: the one-way random effects model (Searle, Casella and McCulloch 1992,
+    "Variance Components"). The estimates are those of the analysis of variance, cut off at 0.
+    Intervals assume normal distributions: that of the runs' variance is of chi-squared, the ratio's
+    is exact (section 3.6 there), and the encoders' is the one of Ting et al. 1990, "Confidence
+    intervals on linear combinations of variance components that are unrestricted in sign", Journal
+    of Statistical Computation and Simulation 35. As variances aren't negative, none ends below 0.
+
+    Returns:
+        The variance of what encoders add, that of what runs add, and the ratio of both.
+    """
+    encoders, runs = returns.shape
+    freedom = encoders - 1, encoders * (runs - 1)
+    between = runs * float(returns.mean(axis=1).var(ddof=1))
+    within = float(returns.var(axis=1, ddof=1).mean())
+    of_runs = Interval(
+        within, *(within * freedom[1] / chi2.ppf(tail, freedom[1]) for tail in _TAILS)
+    )
+    quotient = between / within if within else np.inf
+    ratios = (quotient / f.ppf(tail, *freedom) for tail in _TAILS)
+    ratio = (max((each - 1) / runs, 0.0) for each in (quotient, *ratios))
+    below, above = _half_widths(between, within, freedom)
+    difference = between - within
+    ends = (difference, difference - below, difference + above)
+    of_encoders = (max(end / runs, 0.0) for end in ends)
+    return Interval(*of_encoders), of_runs, Interval(*ratio)
+
+
+def _half_widths(between: float, within: float, freedom: tuple[int, int]) -> tuple[float, float]:
+    """Of the interval of a difference of mean squares: to below and to above."""
+    high, low = _TAILS
+    g1, g2 = (1 - n / chi2.ppf(high, n) for n in freedom)
+    h1, h2 = (n / chi2.ppf(low, n) - 1 for n in freedom)
+    f_high, f_low = f.ppf(high, *freedom), f.ppf(low, *freedom)
+    g12 = ((f_high - 1) ** 2 - (g1 * f_high) ** 2 - h2**2) / f_high
+    h12 = ((1 - f_low) ** 2 - (h1 * f_low) ** 2 - g2**2) / f_low
+    product = between * within
+    return (
+        float(np.sqrt(max((g1 * between) ** 2 + (h2 * within) ** 2 + g12 * product, 0))),
+        float(np.sqrt(max((h1 * between) ** 2 + (g2 * within) ** 2 + h12 * product, 0))),
+    )
 
 
 def of_units(values: Array, encoders: Units) -> Array:
@@ -119,7 +164,6 @@ def of_units(values: Array, encoders: Units) -> Array:
 
 
 def _mean(values: Array, encoders: Units, bounds: Bounds) -> Interval:
-    """The mean over runs (n,), with its interval over units."""
     values = of_units(values, encoders)
     return unless_few(mean_within(values, bounds, LEVEL), len(values))
 

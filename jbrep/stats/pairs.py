@@ -65,13 +65,9 @@ class Pair(NamedTuple):
 
 
 def pair_of(group: Group, x: str, y: str, seeds: Collection[int]) -> Pair | None:
-    """Two representations of a group; None where they share fewer than two of the seeds.
+    """Representations x and y of a group; None where they share fewer than two of the seeds.
 
-    Args:
-        group: runs by representation.
-        x: one representation.
-        y: the other.
-        seeds: that count; what a failed run counts as is known from these alone, too.
+    What a failed run counts as is known from runs of these seeds alone, too.
     """
     counted = with_failure_returns([r for runs in group.values() for r in runs if r.seed in seeds])
     there = {name: [r for r in counted if r.representation == name] for name in group}

@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import nct, t
 
-from jbrep.stats.claims import FASTER, LESS_VARIABLE, NOT_WORSE
+from jbrep.stats.claims import FASTER, LESS_VARIABLE, NOT_WORSE, PERMUTATIONS, Curves, spread_p
 from jbrep.stats.pairs import FEWEST_UNITS
 from jbrep.stats.rules import Planned, Stated, most_failing
-from jbrep.stats.spread import PERMUTATIONS, Curves, spread_p
 
 SDS = (0.1, 0.2, 0.3)
 BETTER_BY, EARLIER_BY = 0.2, 0.1

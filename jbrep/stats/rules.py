@@ -21,15 +21,7 @@ from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.records.record import Record
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.claims import (
-    BETTER,
-    CLAIMS,
-    CONTRADICTED,
-    NOT_WORSE,
-    SUPPORTED,
-    UNDECIDED,
-    Claim,
-)
+from jbrep.stats.claims import BETTER, CLAIMS, CONTRADICTED, NOT_WORSE, SUPPORTED, UNDECIDED, Claim
 from jbrep.stats.intervals import LEVEL, UNDEFINED, unless_few
 from jbrep.stats.pairs import FEWEST_UNITS, Pair, pair_of
 from jbrep.stats.runs import LARGEST_RETURN, Group, Key
@@ -192,7 +184,6 @@ class Planned:
         return [verdict for chain in chains for verdict in chain.every(self.rules, seed)]
 
     def _pair(self, key: Key, group: Group, x: str, y: str) -> Pair | str:
-        """What is compared, or why it can't be yet."""
         if reason := self.prevented.get(key[0]):
             return reason
         for name in (x, y):
@@ -204,8 +195,6 @@ class Planned:
 
 @dataclass
 class _Chain:
-    """Claims on the same two representations while they are tested."""
-
     key: Key
     x: str
     y: str
@@ -253,7 +242,6 @@ class _Chain:
         return {**of, "verdict": UNDECIDED}
 
     def _estimated(self, claim: Claim, pair: Pair, rules: Rules, seed: int) -> Verdict:
-        """An estimate, undecided; with a reason where there is none."""
         learnt = pair.y_learns or not claim.takes_learning
         boundary = claim.boundary(pair, rules.margin)
         reason = None if learnt else f"agents on {self.y} aren't above the blind baselines"

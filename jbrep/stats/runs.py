@@ -8,15 +8,13 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.encoders.names import EncoderName
+from jbrep.encoders.header import EncoderName
 from jbrep.errors import InputError
 from jbrep.stats.bootstrap import Array
 from jbrep.stats.intervals import Bounds
 
 LARGEST_RETURN = 1e15  # of either sign: beyond, a number has diverged
 _ROUNDING = 1e-6  # of returns, relative to the largest
-# alike for all runs of a task
-_OF_TASK = ("return_floor", "return_ceiling", "reference", "top", "solved")
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,52 +23,38 @@ class RunCurve:
 
     A failed run counts as the worst from the step of failure on, so that failing can't count in
     favour of a representation.
-
-    Args:
-        task: the task's name.
-        algorithm: the algorithm's name.
-        representation: what the agent observed: the name of the baseline or of an encoder.
-        seed: of the run.
-        settings: a hash of the settings, or any text; equal for all runs under one label.
-        steps: training steps of the evaluations, (k,), ascending.
-        returns: of each evaluation's episodes, (k, e).
-        total_steps: training steps that were requested.
-        failed_at: training step at which the run failed; None if it didn't.
-        return_floor: the least possible return of an episode of the task; None if unknown.
-        return_ceiling: the largest possible one; None if unknown.
-        reference: the return that gains are counted over, on the starts of evaluation: that of the
-            best policy that doesn't look; None if unknown.
-        reference_in_training: the same on the starts of `returns`; None if that is `reference`.
-        top: the return that scores 1, where `reference` scores 0: that of a policy that can do the
-            task, on the starts of evaluation; None if unknown.
-        top_in_training: the same on the starts of `returns`; None if that is `top`.
-        solved: the return from which on the task counts as solved; None if unknown.
-        environment: what decides which returns there can be; equal likewise.
-        final: the returns of the last evaluation, if it has more episodes than the others, (f,).
-        encoder_seed: of the encoder, if the representation has several.
-        failure_return: what the run counts as once it has failed; None for the floor.
-            `with_failure_returns` sets it for runs that are compared.
     """
 
     task: str
     algorithm: str
-    representation: str
+    representation: str  # what the agent observed: the name of the baseline or of an encoder
     seed: int
-    settings: str
-    steps: NDArray[np.int64]
-    returns: Array
-    total_steps: int
-    failed_at: int | None = None
+    settings: str  # a hash of the settings, or any text; equal for all runs under one label
+    steps: NDArray[np.int64]  # training steps of the evaluations, (k,), ascending
+    returns: Array  # of each evaluation's episodes, (k, e)
+    total_steps: int  # training steps that were requested
+    failed_at: int | None = None  # training step at which the run failed; None if it didn't
+    # the least possible return of an episode of the task; None if unknown
     return_floor: float | None = None
-    return_ceiling: float | None = None
+    return_ceiling: float | None = None  # the largest possible one; None if unknown
+    # the return that gains are counted over, on the starts of evaluation: that of the best policy
+    # that doesn't look; None if unknown
     reference: float | None = None
+    # the same on the starts of `returns`; None if that is `reference`
     reference_in_training: float | None = None
+    # the return that scores 1, where `reference` scores 0: that of a policy that can do the task,
+    # on the starts of evaluation; None if unknown
     top: float | None = None
+    # the same on the starts of `returns`; None if that is `top`
     top_in_training: float | None = None
+    # the return from which on the task counts as solved; None if unknown
     solved: float | None = None
-    environment: str = ""
+    environment: str = ""  # what decides which returns there can be; equal likewise
+    # the returns of the last evaluation, if it has more episodes than the others, (f,)
     final: Array | None = None
-    encoder_seed: int | None = None
+    encoder_seed: int | None = None  # of the encoder, if the representation has several
+    # what the run counts as once it has failed; None for the floor. `with_failure_returns` sets it
+    # for runs that are compared
     failure_return: float | None = None
 
     def __post_init__(self) -> None:
@@ -79,20 +63,12 @@ class RunCurve:
                 f"its number of evaluations is {len(self.steps)}",
                 "a curve needs at least two; the episodes of one evaluation are not runs",
             )
-        every = self.returns if self.final is None else np.append(self.returns, self.final)
-        if every.size:
-            self._check_bounds(float(every.min()), float(every.max()))
-
-    def _check_bounds(self, least: float, largest: float) -> None:
-        rounding = _ROUNDING * max(1, abs(least), abs(largest))
-        if least < self.bounds.low - rounding:
+        every, (low, high) = np.concatenate([*self.evaluations, []]), self.bounds
+        rounding = _ROUNDING * max(1, np.abs(every).max(initial=0))
+        if (every < low - rounding).any() or (every > high + rounding).any():
             raise self._error(
-                f"its least return is {least:g}", f"its task has none below {self.bounds.low:g}"
-            )
-        if largest > self.bounds.high + rounding:
-            raise self._error(
-                f"its largest return is {largest:g}",
-                f"its task has none above {self.bounds.high:g}",
+                f"it returned {every.min():g} to {every.max():g}",
+                f"its task says that returns are from {low:g} to {high:g}",
             )
 
     @property
@@ -140,8 +116,8 @@ def with_failure_returns(runs: Sequence[RunCurve]) -> list[RunCurve]:
     """
     worst: dict[Key, float] = {}
     for run in runs:
-        every = run.returns if run.final is None else np.append(run.returns, run.final)
-        seen = every.min(initial=np.inf) if run.return_floor is None else run.return_floor
+        every = np.concatenate([*run.evaluations, [np.inf]])
+        seen = every.min() if run.return_floor is None else run.return_floor
         key = run.task, run.algorithm
         worst[key] = min(worst.get(key, np.inf), float(seen))
     known = {key: value for key, value in worst.items() if np.isfinite(value)}
@@ -178,9 +154,7 @@ def _ordered(group: Group, key: Key, baseline: str) -> Group:
     ordered = {
         name: sorted(group[name], key=lambda run: run.seed) for name in in_order(group, baseline)
     }
-    for of_label in ordered.values():
-        _check_label(of_label)
-    _check_task(list(chain.from_iterable(ordered.values())), "/".join(key))
+    _check_alike(list(chain.from_iterable(ordered.values())), "/".join(key))
     return ordered
 
 
@@ -193,7 +167,8 @@ def in_order(names: Iterable[str], baseline: str) -> list[str]:
     return sorted(set(names), key=key)
 
 
-def _check_task(runs: list[RunCurve], name: str) -> None:
+def _check_alike(runs: list[RunCurve], name: str) -> None:
+    """Make sure that the runs of a task and algorithm can be compared."""
     if runs[0].failure_return is None:
         raise InputError(f"{name}: every run failed before its first evaluation: see why they did")
     if len(environments := sorted({run.environment for run in runs})) > 1:
@@ -210,24 +185,10 @@ def _check_task(runs: list[RunCurve], name: str) -> None:
             raise InputError(
                 f"{name}: the {what} of its runs have {told} episodes: report those of one number"
             )
-    for what in _OF_TASK:
-        values = sorted({str(getattr(run, what)) for run in runs})
-        if len(values) > 1:
+    for label in dict.fromkeys(run.label for run in runs):
+        settings = sorted({run.settings for run in runs if run.label == label})
+        if len(settings) > 1:
             raise InputError(
-                f"{name}: its runs say different {what}: {', '.join(values)}; give one for a task"
+                f"{label} mixes the settings {', '.join(settings)}: give runs with other settings "
+                "another name"
             )
-
-
-def _check_label(runs: list[RunCurve]) -> None:
-    label, seeds = runs[0].label, [run.seed for run in runs]
-    if len(runs) < 2:
-        raise InputError(f"{label} has one seed: train at least two, preferably ten")
-    if len(set(seeds)) < len(seeds):
-        twice = next(seed for seed in seeds if seeds.count(seed) > 1)
-        raise InputError(f"{label} has seed {twice} twice: give each run once")
-    settings = sorted({run.settings for run in runs})
-    if len(settings) > 1:
-        raise InputError(
-            f"{label} mixes the settings {', '.join(settings)}: give runs with other settings "
-            "another name"
-        )

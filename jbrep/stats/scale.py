@@ -78,10 +78,7 @@ def ends_of(compared: Compared) -> Ends:
 def scale_of(compared: Compared, policies: Mapping[str, Interval]) -> Scale:
     """The scale of a group of runs.
 
-    Args:
-        compared: the runs.
-        policies: mean returns of policies that don't learn, with their intervals, on the starts of
-            the final returns.
+    `policies` are mean returns of policies that don't learn, on the starts of the final returns.
     """
     grid, curves, finals = compared.grid, compared.of_baseline, [*compared.finals.values()]
     run, ends = evaluated_run(compared.runs), ends_of(compared)

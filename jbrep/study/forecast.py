@@ -11,14 +11,14 @@ from typing import NamedTuple
 from jbrep.collect.derive import derive
 from jbrep.dataset.manifest import read_manifest
 from jbrep.encoders import FULL
-from jbrep.encoders.file import SUFFIX
-from jbrep.encoders.names import of_seed
+from jbrep.encoders.encoder import SUFFIX
+from jbrep.encoders.header import of_seed
 from jbrep.envs.names import is_code
 from jbrep.methods.fit import Fitter
 from jbrep.progress import Progress
 from jbrep.records.storage import exists
 from jbrep.rl import Run
-from jbrep.rl.speed import estimate
+from jbrep.rl.run import estimate
 from jbrep.stats.power import Prospect, prospects
 from jbrep.study.config import UNIFORM, data_key
 from jbrep.study.plan import Cell, Plan

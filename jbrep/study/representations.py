@@ -10,8 +10,8 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from jbrep.encoders import FULL
-from jbrep.encoders.file import SUFFIX
-from jbrep.encoders.names import check_name, of_seed
+from jbrep.encoders.encoder import SUFFIX
+from jbrep.encoders.header import check_name, of_seed
 from jbrep.envs.names import is_code
 from jbrep.errors import InputError
 from jbrep.methods.registry import Recipe, get_method, read_name

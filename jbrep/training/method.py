@@ -195,7 +195,6 @@ class Reconstructing(Learned, frozen=True, kw_only=True):
 
 
 def _read(value: Any, kind: Any, name: str) -> Any:
-    """A setting from text, or one value where several can be."""
     if isinstance(value, str):
         return from_text(value, kind, name)
     is_list = isinstance(bare(type_of(kind)), inspect.CollectionType)

@@ -1,10 +1,11 @@
-"""Training any objective: batches, epochs, and what an epoch changes."""
+"""Training any objective: batches, epochs, and checkpoints, which run nothing when read."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -13,11 +14,11 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
-from jbrep.errors import InputError
-from jbrep.records.record import Finite
+from jbrep.errors import InputError, differences
+from jbrep.records import container
+from jbrep.records.record import Finite, Record, from_plain, to_plain
 from jbrep.training.objective import Objective
-from jbrep.training.rows import POOL, shuffled
-from jbrep.training.windows import Windows
+from jbrep.training.windows import POOL, Windows, shuffled
 
 if TYPE_CHECKING:
     from jbrep.training.method import Learned
@@ -53,6 +54,11 @@ class Epoch(NamedTuple):
 
     train_loss: Finite  # mean over the epoch, of parameters as they were then, with noise
     test_loss: Finite  # after the epoch, from clean held-out rows
+
+
+class _Checkpoint(Record, frozen=True, kw_only=True):
+    identity: dict[str, Any]  # what must be equal for training to resume
+    history: tuple[Epoch, ...]
 
 
 def get_device(name: str) -> torch.device:
@@ -116,6 +122,35 @@ class Trainer:
                 self._epoch()
                 yield self.history[-1]
 
+    def save(self, identity: Mapping[str, Any], path: Path) -> None:
+        """Write the state after an epoch, with what must be equal to resume it, as plain JSON."""
+        tensors = {name: tensor.cpu().numpy() for name, tensor in self._state.items()}
+        header = _Checkpoint(identity=dict(identity), history=tuple(self.history))
+        container.write(path, tensors, to_plain(header))
+
+    def restore(self, identity: Mapping[str, Any], path: Path) -> None:
+        """Go on from the state that a file holds."""
+        tensors, header = container.read(path, "checkpoint")
+        saved, state = from_plain(header, _Checkpoint), self._state
+        if differing := differences(saved.identity, identity):
+            raise InputError(
+                f"{path} belongs to another configuration: {differing}; choose another folder, or "
+                "delete it to start over"
+            )
+        for name, tensor in state.items():
+            tensor.copy_(torch.from_numpy(tensors[name]))
+        self.history = list(saved.history)
+
+    @property
+    def _state(self) -> dict[str, Tensor]:
+        """Everything that an epoch changes, by name; the tensors themselves."""
+        named = {f"network.{name}": p for name, p in self.objective.state_dict().items()}
+        named |= {f"best.{name}": p for name, p in self.best.items()}
+        for name, parameter in self.objective.named_parameters():
+            moments = self.optimiser.state[parameter].items()
+            named |= {f"adam.{name}.{key}": value for key, value in moments}
+        return named
+
     def _epoch(self) -> None:
         number = len(self.history) + 1
         count = len(self._windows)
@@ -150,12 +185,10 @@ class Trainer:
         return self.schedule.learning_rate * self.objective.rate(progress, step)
 
     def _batches(self, number: int) -> Iterator[Any]:
-        """Every window once."""
         for drawn in prefetch(self._draws(number)):
             yield from drawn
 
     def _draws(self, number: int) -> Iterator[list[Any]]:
-        """The same, several batches at a time."""
         words = np.random.SeedSequence((self.schedule.seed, number)).generate_state(1, np.uint64)
         generator = torch.Generator(self._windows.device).manual_seed(int(words[0]))
         order = shuffled(len(self._windows), self._pool, generator)

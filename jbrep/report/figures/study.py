@@ -37,8 +37,6 @@ _DASHED = " Dashed: policies that don't learn; dotted: the return that counts as
 
 
 class _Spec(NamedTuple):
-    """A row of the table of plots."""
-
     name: str
     title: str
     caption: str
@@ -63,7 +61,6 @@ def study_plots(found: Findings) -> list[Plot]:
 
 
 def _counts(found: Findings, representation: str) -> str:
-    """How many runs a representation has, over all tasks and algorithms."""
     labels = [run.label for run in found.runs if run.label.rpartition("/")[2] == representation]
     counts = sorted({labels.count(label) for label in labels})
     return "\N{EN DASH}".join(map(str, dict.fromkeys((*counts[:1], *counts[-1:]))))

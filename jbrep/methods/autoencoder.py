@@ -194,7 +194,6 @@ class Gradient:
 
 
 def _activate(activation: nn.Module, values: Tensor) -> None:
-    """Apply an activation in place."""
     if isinstance(activation, nn.Tanh):  # as 2 sigmoid(2x) - 1: a third of torch.tanh's time
         values.mul_(2).sigmoid_().mul_(2).sub_(1)
     elif isinstance(activation, nn.ReLU):
