@@ -1,10 +1,9 @@
 """The data sets and encoders that a study's runs need."""
 
-import signal
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
+from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any, NamedTuple
 
 from jbrep.collect import collect
@@ -24,7 +23,7 @@ from jbrep.machine import cores
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method
 from jbrep.play.sources import find_policy
-from jbrep.pool import ATTEMPTS, Pool
+from jbrep.pool import ATTEMPTS, side_by_side
 from jbrep.records.storage import exists
 from jbrep.rl import Run
 from jbrep.study.config import Data, Study, data_key
@@ -144,59 +143,44 @@ def prepare(plan: Plan, workers: int = 1) -> None:
         for each in waiting:
             _make(plan, each, sources[each], None)
         return
-    under_way, deaths = set[Made](), Counter[Made]()
-    with Pool[Made, str](_work, workers, lambda: None) as pool:
-        while waiting or under_way:
-            missing = under_way.union(waiting)
-            ready = [each for each in waiting if sources[each] not in missing]
-            if ready and not pool.is_full:
-                each = ready[0]
+    under_way = set[Made]()
+
+    def next_job() -> tuple[Made, Made | None] | None:
+        missing = under_way.union(waiting)
+        for each in waiting:
+            if sources[each] not in missing:
                 waiting.remove(each)
                 under_way.add(each)
-                given = plan.study, plan.folder, each, sources[each], threads
-                pool.submit(each, *given, imported_modules())
-                continue
-            each, mistake = pool.result()
+                return each, sources[each]
+        return None
+
+    make = partial(_work, plan.study, plan.folder, threads, imported_modules())
+    with closing(side_by_side(make, next_job, workers)) as made:
+        for (each, _), mistake in made:
             under_way.remove(each)
             if mistake:
                 raise InputError(mistake)
             if mistake is None:
-                deaths[each] += 1
-                waiting.insert(0, each)
-                if deaths[each] == ATTEMPTS:
-                    raise InputError(
-                        f"the worker that makes {each} was killed {ATTEMPTS} times, perhaps "
-                        "because memory ran out: try fewer --workers"
-                    )
+                raise InputError(
+                    f"the worker that makes {each} was killed {ATTEMPTS} times, perhaps because "
+                    "memory ran out: try fewer --workers"
+                )
 
 
 def _work(
     study: Study,
     folder: Path,
-    made: Made,
-    source: Made | None,
     threads: int,
     modules: Iterable[str],
+    job: tuple[Made, Made | None],
 ) -> str:
-    """As `_make`, in a worker, which a request to stop interrupts; what a user did wrong."""
-    asked = signal.getsignal(signal.SIGTERM)
-    assert callable(asked)
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        asked(number, frame)
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, stop)
+    """As `_make`, in a worker; what a user did wrong."""
     try:
         import_modules(modules)
-        _make(Plan(study, folder), made, source, threads)
+        _make(Plan(study, folder), *job, threads)
         return ""
     except InputError as error:
         return str(error)
-    except KeyboardInterrupt:
-        return "it was stopped"  # which no one hears
-    finally:
-        signal.signal(signal.SIGTERM, asked)
 
 
 def _make(plan: Plan, made: Made, source: Made | None, threads: int | None) -> None:

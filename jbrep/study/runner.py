@@ -2,11 +2,11 @@
 
 import sys
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager, closing, nullcontext
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.live import Live
@@ -14,7 +14,7 @@ from rich.table import Table
 
 from jbrep.envs.names import imported_modules
 from jbrep.machine import cores
-from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
+from jbrep.pool import ATTEMPTS, on_cluster, side_by_side
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, make_folder
 from jbrep.rl.files import FAILED, FINISHED, read_run
@@ -36,6 +36,8 @@ from jbrep.text import duration
 
 _OWN = STUDY, REGISTRATION, REFERENCE_RETURNS, "data", "encoders", "runs"  # see `make_folder`
 
+_PATIENCE = 60.0  # seconds, until runs have written their checkpoints
+
 Backend = Callable[[Plan, Iterable[Cell], int], Generator[Outcome]]
 
 
@@ -50,21 +52,14 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
     A run whose worker is killed is resumed from its checkpoint by another, up to five times. Closed
     early, this waits until the runs under way have written their checkpoints.
     """
-    waiting, deaths = deque(cells), Counter[str]()
-    with Pool[Cell, Outcome | None](work, workers, _announce_stop) as pool:
-        while waiting or not pool.is_idle:
-            while waiting and not pool.is_full:
-                cell = waiting.popleft()
-                pool.submit(cell, *_job(plan, cell))
-            cell, outcome = pool.result()
-            if outcome is not None:
-                yield outcome
-                continue
-            deaths[cell.name] += 1
-            if deaths[cell.name] == ATTEMPTS:
-                yield _killed(cell.name)
-            else:
-                waiting.append(cell)
+    jobs = map(plan.assigned, cells)
+    train = partial(work, modules=imported_modules())
+    ended = side_by_side(
+        train, lambda: next(jobs, None), workers, _PATIENCE, stopping=_announce_stop
+    )
+    with closing(ended):
+        for job, outcome in ended:
+            yield outcome or _killed(job.name)
 
 
 def _announce_stop() -> None:
@@ -86,7 +81,8 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome
     import ray
 
     task = on_cluster(work, workers, gpus=int(plan.device == CUDA))
-    under_way = {task.remote(*_job(plan, cell)): cell for cell in cells}
+    known = imported_modules()
+    under_way = {task.remote(plan.assigned(cell), known): cell for cell in cells}
     try:
         while under_way:
             (done,), _ = ray.wait(list(under_way))
@@ -104,11 +100,6 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome
 
 
 BACKENDS: dict[str, Backend] = {"local": on_this_machine, "ray": on_ray}
-
-
-def _job(plan: Plan, cell: Cell) -> tuple[Any, ...]:
-    """The arguments of `work`."""
-    return plan.assigned(cell), stop_requested, imported_modules()
 
 
 def run_study(

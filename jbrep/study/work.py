@@ -3,13 +3,14 @@
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError, first_line
+from jbrep.pool import stop_requested
 from jbrep.records.storage import make_folder, read_file, write_note
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.history import History
@@ -38,16 +39,11 @@ class Assigned(NamedTuple):
     folder: Path  # of this run alone
 
 
-def work(
-    assigned: Assigned,
-    stop: Callable[[], bool] = lambda: False,
-    modules: Iterable[str] = (),
-) -> Outcome | None:
+def work(assigned: Assigned, modules: Iterable[str] = ()) -> Outcome | None:
     """Train a run; an error is reported in its outcome and stops no other run.
 
     Args:
         assigned: the run.
-        stop: whether to write a checkpoint and stop now.
         modules: to import first, as they register environments.
 
     Returns:
@@ -57,7 +53,7 @@ def work(
         make_folder(assigned.folder)
         import_modules(modules)
         watch = _ProgressFile(assigned.folder, assigned.run.steps)
-        result = train(assigned.run, assigned.folder, Session(watch, stop=stop))
+        result = train(assigned.run, assigned.folder, Session(watch, stop=stop_requested))
     except StoppedError:
         return None
     except Exception as error:

@@ -58,7 +58,7 @@ def wait_for(happened, process, seconds=120):
 
 def workers_of(pid):
     """The workers of the study that a process runs."""
-    found = subprocess.run(["pgrep", "-P", str(pid), "-f", "spawn_main"], capture_output=True)
+    found = subprocess.run(["pgrep", "-P", str(pid), "-f", "popen_loky"], capture_output=True)
     return [int(each) for each in found.stdout.split()]
 
 
