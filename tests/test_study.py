@@ -1,7 +1,6 @@
 """Studies: their files, preparation, workers, kills, clusters and results."""
 
 import csv
-import hashlib
 import json
 import os
 import shutil
@@ -30,7 +29,7 @@ from small import adopt, forge
 from jbrep.dataset import Dataset
 from jbrep.encoders import load
 from jbrep.envs import describe
-from jbrep.errors import DamageError, InputError, Notice
+from jbrep.errors import InputError
 from jbrep.play.sources import find_player, find_untrained
 from jbrep.report.findings import Findings
 from jbrep.report.report import results_text
@@ -41,14 +40,17 @@ from jbrep.stats.rules import Rules
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, as_study, read_study
 from jbrep.study.forecast import forecast
-from jbrep.study.plan import STUDY, Plan, read_plan
+from jbrep.study.plan import PROGRESS, STUDY, Plan, read_plan
 from jbrep.study.prepare import check, prepare
-from jbrep.study.record import runs_record
+from jbrep.study.record import RunsRecord
 from jbrep.study.representations import ByName
-from jbrep.study.results import read_runs, write_tables
-from jbrep.study.runner import Progress, on_this_machine, run_study
-from jbrep.study.tables import REFERENCE_RETURNS, RETURNS, read_references, write_references
-from jbrep.study.work import PROGRESS, Outcome, work
+from jbrep.study.runner import Outcome, Progress, on_this_machine, run_study, work
+from jbrep.study.tables import (
+    REFERENCE_RETURNS,
+    RETURNS,
+    read_curves,
+    write_tables,
+)
 
 ROOT = Path(__file__).parent.parent
 TINY = Study(
@@ -195,24 +197,19 @@ def test_a_study_without_seeds_or_with_settings_of_no_encoder_is_refused():
 @pytest.mark.parametrize("representations", [("pca-8",), ("full",)])
 def test_a_study_without_comparisons_says_so_first(representations, tmp_path, monkeypatch):
     study = TINY.replace(representations=representations)
-    assert study.comparisons == 0
     assert "compares nothing" in study.notices[0]
-    assert TINY.comparisons == 1
     against = TINY.replace(representations=("pca-8", "pca-4"), verdicts=Rules(baseline="pca-4"))
-    assert (against.comparisons, against.baseline) == (1, "pca-4")
+    assert against.baseline == "pca-4"
     assert TINY.replace(representations=("pca-8", "pca-4")).baseline == "pca-8"
     with pytest.raises(InputError, match=r"baseline is 'pca-9': it must be one of .*, full, pca-8"):
         TINY.replace(verdicts=Rules(baseline="pca-9"))
     assert TINY.notices == [
         "This study is exploratory: its report will give no verdicts, as its file has no "
         "verdicts.claims.",
-        "Encoders that ship with jbrep: pca-8. Your own are tables with a file: {name = ..., "
-        "file = ...}.",
     ]
     few = TINY.replace(algorithms=("sac-wide",), seeds=(0,)).notices
     assert few[0] == "This study compares nothing: it has one seed."
     assert few[1].startswith("sac-wide learns from step 25,600 on: ")
-    assert TINY.replace(data={"": Data(steps=1000)}).notices == TINY.notices[:1]
     path = written(tmp_path, f"representations = {json.dumps(representations)}")
     monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
@@ -344,7 +341,7 @@ def test_a_study_that_is_refused_changes_nothing(done, tmp_path):
 
 def test_other_runs_in_its_folder_draw_nothing(done):
     ended = {path.parent: read_run(path.parent) for path in done.folder.rglob(RUN)}
-    record = runs_record(done.folder, ended, {})
+    record = RunsRecord.of(done.folder, ended)
     assert record.draws_of("sac+learning_starts=120") == {}
 
 
@@ -450,8 +447,10 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     plan.write()
     finished, begun, *_ = plan.cells
     shutil.copytree(done.folder_of(finished), plan.folder_of(finished))
-    stop = iter((False, True)).__next__  # after its first rollout
-    assert work(plan.assigned(begun), stop) is None
+    with monkeypatch.context() as patch:
+        stop = iter((False, True)).__next__  # after its first rollout
+        patch.setattr("jbrep.study.runner.stop_requested", stop)
+        assert work(plan.assigned(begun)) is None
     assert (plan.folder_of(begun) / CHECKPOINT).exists()
     reported = jbrep("report", out, "--json")
     assert reported.exit_code == 0, reported.output
@@ -572,34 +571,6 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     assert "--import PACKAGE" in refused.stderr  # its file names no module
 
 
-def test_no_references_no_table_and_damaged_ones_are_named(tmp_path):
-    path, header = tmp_path / REFERENCE_RETURNS, "task,policy,episode,return\n"
-    assert write_references([], tmp_path, {}) is None
-    assert read_references(tmp_path, None) == {}
-    path.write_text(header + "a,b,0,x\n")
-    with pytest.raises(DamageError, match=r"references\.csv is damaged or cut short"):
-        read_references(tmp_path, hashlib.sha256(path.read_bytes()).hexdigest())
-
-
-def test_references_of_an_environment_that_is_not_here_stay(tmp_path):
-    """Even of fewer episodes than are wanted; they can't be made again where they are damaged."""
-    path, header = tmp_path / REFERENCE_RETURNS, "task,policy,episode,return\n"
-    away = describe("face_direction").replace(id="Away/Robot-v0", name="Away/Robot-v0")
-    path.write_text(header + "Away/Robot-v0,random,0,1.0\n")
-    before = path.read_bytes()
-    with pytest.warns(Notice, match="couldn't be played on Away/Robot-v0: "):
-        sha256 = write_references([(away, 2)], tmp_path, {})
-    assert path.read_bytes() == before
-    assert read_references(tmp_path, sha256) == {"Away/Robot-v0": {"random": [1.0]}}
-    path.write_text(header + "Away/Robot-v0,random,0,2.0\n")
-    with (
-        pytest.warns(Notice, match="couldn't be played"),
-        pytest.raises(DamageError, match=r"references\.csv was changed"),
-    ):
-        write_references([(away, 2)], tmp_path, {REFERENCE_RETURNS: sha256})
-    assert path.exists()
-
-
 def test_one_study_at_a_time(done):
     from jbrep.records.lock import exclusive
 
@@ -628,12 +599,12 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
     if name != RUN:
         adopt(tmp_path / RUN, name)
     with pytest.raises(InputError, match=message):
-        read_runs(tmp_path)
+        read_curves(tmp_path)
 
 
 def test_a_folder_without_runs_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no finished run below .* train one with jbrep rl"):
-        read_runs(tmp_path)
+        read_curves(tmp_path)
 
 
 def test_a_run_is_played_before_and_after_training_with_another_body(done):

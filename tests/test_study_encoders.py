@@ -24,6 +24,7 @@ from jbrep.errors import DamageError, InputError
 from jbrep.evaluate.evaluation import EVALUATION, Score
 from jbrep.evaluate.table import DIAGNOSTICS, read_diagnostics
 from jbrep.records.record import to_plain
+from jbrep.report.diagnostics import add_diagnostics
 from jbrep.report.findings import Findings
 from jbrep.report.report import commands
 from jbrep.report.tables import read_tables
@@ -33,13 +34,11 @@ from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.policy import load_run
 from jbrep.study.config import Data, as_study
 from jbrep.study.forecast import forecast
-from jbrep.study.plan import Plan, read_plan
+from jbrep.study.plan import Assigned, Plan, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.record import EACH_ITS_OWN, RECORD
-from jbrep.study.results import write_tables
-from jbrep.study.runner import run_study
-from jbrep.study.tables import add_diagnostics
-from jbrep.study.work import Assigned, work
+from jbrep.study.runner import run_study, work
+from jbrep.study.tables import write_tables
 
 TASK = "face_direction"
 NET = "my_encoders:Net"

@@ -135,8 +135,8 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
         from jbrep.encoders.shipped import source_of
         from jbrep.envs.infos import shares_text
         from jbrep.envs.make import is_one_robot
+        from jbrep.play.references import beside
         from jbrep.rl.files import EVALUATIONS, last_infos, read_evaluations, read_infos
-        from jbrep.study.single import beside
 
         task = options["task"]
         with _told_when_stopped(received, f"; {RESUMES}" if task.reproducible else ""):

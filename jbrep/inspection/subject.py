@@ -28,7 +28,7 @@ from jbrep.rl.files import ENCODER, check_begun, is_run
 from jbrep.stats import RunCurve
 from jbrep.stats.bootstrap import Array
 from jbrep.stats.runs import in_order, with_failure_returns
-from jbrep.study.results import has_runs, read_runs
+from jbrep.study.tables import has_runs, read_curves
 
 FOLDER = Path("inspect")  # of recordings without an --out
 _POLICY = "uniform"  # plays the episode that an encoder alone is shown on
@@ -71,7 +71,7 @@ def inspect(
                 "--task, --encoder and --traverse: give one run's folder to see an episode"
             )
         out = out or _default(source, "curves")
-        record_curves(read_runs(Path(source)), source, out)
+        record_curves(read_curves(Path(source)), source, out)
         return out
     rollout, shown = _find(source, episode or 0, task, encoder)
     if isinstance(encoder, (str, Path)):

@@ -151,7 +151,7 @@ def of_a_commit():
     """Code and registrations are of a commit in here, also where a contributor has changed some."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Plan, "in_git", True)
-        for module in ("jbrep.study.registration", "jbrep.rl.training"):
+        for module in ("jbrep.study.plan", "jbrep.rl.training"):
             patch.setattr(f"{module}.commits", lambda: COMMITS)
         yield
 
