@@ -123,99 +123,51 @@ def test_a_study_from_toml(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("line", "message"),
+    ("line", "field"),
     [
-        ("task = 7", "unknown task: it must be one of steps, .*, tasks, algorithms"),
+        ("task = 7", "unknown task"),
         ('tasks = ["fly"]', "unknown task 'fly'"),
-        ('tasks = [".."]', "unknown task '..'"),
-        ('tasks = ["my_robots:Robot-v0"]', "only; elsewhere give the id alone, and --import"),
-        (
-            'tasks = ["Robots/Ant-v0", "Robots-Ant-v0"]',
-            "Robots/Ant-v0 and Robots-Ant-v0 would share a folder",
-        ),
-        ('algorithms = ["dqn"]', "unknown algorithm 'dqn'"),
+        ('tasks = ["Robots/Ant-v0", "Robots-Ant-v0"]', "share a folder"),
         ('algorithms = ["a2c-best"]', "unknown preset 'best'"),
-        *(
-            (
-                f'representations = ["full", "{name}"]',
-                f"unknown representation '{name}': it must be full, or a method",
-            )
-            for name in ("fit-8", "dae-wide-8", "pca", "pca-08", "pca-0", "pca-deep-8", "full-8")
-        ),
-        ('representations = ["full", "full"]', "representations is .*each once"),
-        ("seeds = []", r"seeds is \[\]"),
-        ("seeds = 0", r"seeds is 0"),
-        ("seeds = [0.5]", r"seeds\[0\] is 0.5"),
-        ("seeds = true", "seeds is True"),
-        ("seeds = [-1]", r"seeds\[0\] is -1"),
-        ("steps = 0", "steps is 0: it must be"),
-        ("learners = {}", "unknown 'learners': settings of an algorithm are in algorithms.NAME"),
-        (f"steps = {10**23}", "steps"),
-        ("steps = '80'", "steps is '80'"),
-        (
-            "evaluation_episodes = 5\nfinal_episodes = 2",
-            "final_episodes is 2: it must be as many as evaluation_episodes, 5, or more",
-        ),
-        ('domain = {delay = "2..0"}', r"delay is 2\.\.0: swap them"),
-        ("episode_steps = 1.5", "episode_steps is 1.5"),
-        ("environment = 7", "environment is 7"),
-        ("environment = {g = 1979-05-27}", "environment has a date, or a num"),
-        ("environment = {g = inf}", "environment has a date, or a num"),
-        ("data = 7", "data is 7"),
-        ("data = {rows = 7}", "unknown data.rows"),
-        ("data = {}", "data: it must have either steps"),
-        ('data = {folder = "it", sets = 2}', "sets is 2: it is left out where there is a folder"),
-        ("training = {epochs = 3}", r"\[data\] is missing"),
-        *(
-            (f"data = {{steps = 9}}\ntraining = {training}", message)
-            for training, message in [
-                ("{depth = 3}", "unknown training.depth: it must be one of epochs, "),
-                ("{latent = 3}", "unknown training.latent"),
-                ("{epochs = 'many'}", "training.epochs is 'many'"),
-                ("{epochs = 0}", "epochs"),
-                ("7", "training is 7"),
-            ]
-        ),
-        ("steps 80", "is not valid TOML"),
+        ('representations = ["full", "dae-wide-8"]', "unknown representation 'dae-wide-8'"),
+        ('representations = ["full", "full"]', "representations"),
+        ("seeds = 0", "seeds"),
+        ("seeds = [0.5]", "seeds"),
+        ("steps = '80'", "steps"),
+        ("evaluation_episodes = 5\nfinal_episodes = 2", "final_episodes"),
+        ('domain = {delay = "2..0"}', "delay"),
+        ("environment = {g = inf}", "environment"),
+        ("data = {rows = 7}", "data.rows"),
+        ('data = {folder = "it", sets = 2}', "sets"),
+        ("training = {epochs = 3}", "data"),
+        ("data = {steps = 9}\ntraining = {latent = 3}", "training.latent"),
+        ("steps 80", "TOML"),
     ],
 )
-def test_a_mistaken_study_is_refused(line, message, tmp_path):
+def test_a_mistaken_study_is_refused(line, field, tmp_path):
     path = written(tmp_path, line)
-    with pytest.raises(InputError, match=message) as error:
+    with pytest.raises(InputError, match=field) as error:
         read_study(path)
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
 
 
-def test_a_study_without_seeds_or_with_settings_of_no_encoder_is_refused():
-    with pytest.raises(InputError, match="seeds is missing"):
-        as_study({"tasks": ["face_direction"], "algorithms": ["a2c"], "representations": ["full"]})
-    with pytest.raises(InputError, match=r"unknown training\.depth"):
-        TINY.replace(representations=("full",), data={"": Data(steps=9)}, training={"depth": 3})
-
-
-@pytest.mark.parametrize("representations", [("pca-8",), ("full",)])
-def test_a_study_without_comparisons_says_so_first(representations, tmp_path, monkeypatch):
-    study = TINY.replace(representations=representations)
-    assert "compares nothing" in study.notices[0]
-    against = TINY.replace(representations=("pca-8", "pca-4"), verdicts=Rules(baseline="pca-4"))
-    assert against.baseline == "pca-4"
-    assert TINY.replace(representations=("pca-8", "pca-4")).baseline == "pca-8"
-    with pytest.raises(InputError, match=r"baseline is 'pca-9': it must be one of .*, full, pca-8"):
+def test_what_a_study_can_not_show_is_said_first(tmp_path, monkeypatch):
+    two = TINY.replace(representations=("pca-8", "pca-4"))
+    assert (two.baseline, two.replace(verdicts=Rules(baseline="pca-4")).baseline) == (
+        "pca-8",
+        "pca-4",
+    )
+    with pytest.raises(InputError, match=r"baseline is 'pca-9'"):
         TINY.replace(verdicts=Rules(baseline="pca-9"))
-    assert TINY.notices == [
-        "This study is exploratory: its report will give no verdicts, as its file has no "
-        "verdicts.claims.",
-    ]
+    assert "exploratory" in TINY.notices[0]
     few = TINY.replace(algorithms=("sac-wide",), seeds=(0,)).notices
-    assert few[0] == "This study compares nothing: it has one seed."
     assert few[1].startswith("sac-wide learns from step 25,600 on: ")
-    path = written(tmp_path, f"representations = {json.dumps(representations)}")
+    path = written(tmp_path, 'representations = ["full"]')
     monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
     assert "This study compares nothing: it has one" in told.stderr
     assert max(map(len, told.stderr.splitlines())) <= 80
-    assert "1.0 h" not in told.stdout
 
 
 def test_a_study_is_read_without_its_environments(tmp_path, monkeypatch):

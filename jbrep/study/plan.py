@@ -76,22 +76,6 @@ class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
     def as_json(self) -> dict[str, Any]:
         return {**super().as_json(), _SEAL: self.sha256}
 
-    @classmethod
-    def of(cls, study: Study, **beforehand: Any) -> "Registration":
-        """The registration of a study, now.
-
-        Args:
-            study: its settings.
-            beforehand: encoders, policies and data that are there, and committed.
-        """
-        return cls(
-            study=to_plain(study),
-            **beforehand,
-            date=datetime.now(UTC).isoformat(timespec="seconds"),
-            versions=packages(),
-            commits=dict(commits()),
-        )
-
     def differences(self, study: Study) -> str:
         """How a study differs from the registered one, but for its title and added seeds."""
         kept = [seed for seed in study.seeds if seed in self.registered.seeds]
@@ -271,10 +255,6 @@ class Plan:
         """A run's folder."""
         return self.folder / "runs" / cell.name
 
-    def has_ended(self, cell: Cell) -> bool:
-        """Whether a run has finished or failed."""
-        return exists(self.folder_of(cell) / RUN)
-
     def progress(self, cell: Cell) -> tuple[int, str]:
         """The steps that a run has done, and the mean return of its last evaluation as text."""
         with suppress(InputError, ValueError):
@@ -285,7 +265,7 @@ class Plan:
     @property
     def unfinished(self) -> list[Cell]:
         """The runs that have neither finished nor failed."""
-        return [cell for cell in self.cells if not self.has_ended(cell)]
+        return [cell for cell in self.cells if not exists(self.folder_of(cell) / RUN)]
 
     def task(self, name: str) -> Task:
         """A task with the study's arguments, time limit and domain."""
@@ -395,6 +375,19 @@ class Plan:
     def has_begun(self) -> bool:
         """Whether it has runs, at whatever step."""
         return any((self.folder / "runs").glob("**/*.*"))
+
+    def to_register(self, policies: dict[str, str]) -> Registration:
+        """What is going to be run, as it is now, and the policies that will collect data."""
+        return Registration(
+            study=to_plain(self.study),
+            encoders=self.fingerprints,
+            policies=policies,
+            data=self.existing_data,
+            date=datetime.now(UTC).isoformat(timespec="seconds"),
+            versions=packages(),
+            commits=dict(commits()),
+            committed=self.in_git,
+        )
 
     def register(self, registration: Registration) -> None:
         """Write down what is going to be run."""

@@ -2,14 +2,12 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
-from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import FULL, load
 from jbrep.encoders.base import OWN
 from jbrep.envs.task import Task
@@ -48,14 +46,6 @@ class LabelSettings(SharedSettings, frozen=True, kw_only=True):
         )
 
 
-class ShownFacts(Record, frozen=True, kw_only=True, forbid_unknown_fields=False):
-    """What reports show of how an encoder was made; other facts stand beside."""
-
-    scaling: str = EXTREMA  # of the features
-    train_rows: Count | None = None
-    held_out_mse: float | None = None
-
-
 class EncoderFacts(Record, frozen=True, kw_only=True):
     """What is known of the encoders of a label, as far as they are alike."""
 
@@ -68,14 +58,6 @@ class EncoderFacts(Record, frozen=True, kw_only=True):
     training: Mapping[str, Any] = {}  # settings
     data: Mapping[str, Any] = {}  # that it was trained on
     metrics: Mapping[str, Any] = {}  # of the training
-
-    def check(self) -> None:
-        _ = self.shown
-
-    @cached_property
-    def shown(self) -> ShownFacts:
-        """What reports show of its training, data and metrics."""
-        return from_plain({**self.training, **self.data, **self.metrics}, ShownFacts)
 
     @classmethod
     def of(cls, folder: Path, run: RunRecord) -> "EncoderFacts":

@@ -32,7 +32,6 @@ from jbrep.study.plan import (
     Assigned,
     Cell,
     Plan,
-    Registration,
     beside,
     find_committed,
     registration_in,
@@ -192,7 +191,7 @@ def run_study(
         if registered:
             plan.register(registered)
         elif plan.study.has_claims and not plan.has_begun:
-            plan.register(_registration(plan))
+            plan.register(plan.to_register(policies(plan)))
         prepare(plan, workers)
         for cell in plan.cells:  # so that any mistake shows before the first run
             if standing_of(plan.run(cell), plan.folder_of(cell)).ended:
@@ -221,23 +220,13 @@ def register_study(plan: Plan) -> Path:
             plan.begin()
             plan.write()
             if plan.registration is None:
-                plan.register(_registration(plan))
+                plan.register(plan.to_register(policies(plan)))
         return plan.folder / REGISTRATION
     path = beside(plan.file)
     if not exists(path) or registration_in(path).registered != plan.study:
         plan.check_new()
-        _registration(plan).write(path)
+        plan.to_register(policies(plan)).write(path)
     return path
-
-
-def _registration(plan: Plan) -> Registration:
-    return Registration.of(
-        plan.study,
-        encoders=plan.fingerprints,
-        policies=policies(plan),
-        data=plan.existing_data,
-        committed=plan.in_git,
-    )
 
 
 class Progress:

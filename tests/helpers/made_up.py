@@ -122,7 +122,7 @@ def drawn(plot):
 def make_runs(plan, seeds):
     """Runs as jbrep rl leaves them, of those seeds."""
     for cell in plan.cells:
-        if cell.seed in seeds and not plan.has_ended(cell):
+        if cell.seed in seeds and cell in plan.unfinished:
             _make_run(plan, cell)
 
 
