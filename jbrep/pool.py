@@ -1,180 +1,166 @@
-"""Workers that take one job at a time: processes on this machine, or a Ray cluster's.
+"""Jobs side by side: in loky's processes on this machine, or as tasks of a Ray cluster.
 
-Processes never outlive the one that started them. This module imports the standard library alone,
-so that a new one watches its parent before the seconds that it takes to import torch.
+This module imports the standard library alone, so that a new process watches its parent before the
+seconds that it takes to import torch.
 """
 
-import multiprocessing
 import os
 import signal
 import socket
-import sys
 import threading
-import time
-import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection, wait
-from types import ModuleType
-from typing import Any, Generic, TypeVar
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Mapping
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from contextlib import suppress
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
 
-ATTEMPTS = 5  # at a job whose worker is killed
+ATTEMPTS = 5  # at a job whose process is killed
 _ANSWERS_WITHIN = 10.0  # seconds, a cluster
-_STOPPING_SECONDS = 60.0  # that jobs under way have to stop before they are killed
+_CLOSED_WITHIN = 60.0  # seconds, what a process has open
 _SINGLE_THREADED = dict.fromkeys(
     ("MKL_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
-_stop = threading.Event()  # set in a worker that is asked to stop
+_stop = threading.Event()  # set in a process that is asked to stop
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
 
 
-class WorkerError(RuntimeError):
-    """A job raised an error, whose traceback the worker has shown; its last line."""
+def side_by_side(
+    function: Callable[[_Job], _Result],
+    next_job: Callable[[], _Job | None],
+    workers: int,
+    patience: float = 0.0,
+    stopping: Callable[[], None] = lambda: None,
+) -> Generator[tuple[_Job, _Result | None]]:
+    """Run jobs in processes of one thread each; yield each with its result, as they end.
 
-
-class Pool(Generic[_Job, _Result]):
-    """Workers, started as they are needed; those that die are replaced.
-
-    On leaving its context, jobs under way are asked to stop (see `stop_requested`) and waited for.
+    A job whose process is killed is tried again; after five times it is given up, with None as its
+    result. On leaving, jobs under way are asked to stop (see `stop_requested`), and killed once
+    that has taken too long. Processes never outlive this one.
 
     Args:
-        function: what a worker calls with a job's arguments; importable by its name.
-        size: the most workers at a time.
+        function: what a process calls with a job.
+        next_job: what to begin; None if there is nothing, at least until another job has ended.
+        workers: the most processes at a time.
+        patience: how long jobs may take to stop [s].
         stopping: called on leaving with jobs under way.
     """
-
-    def __init__(self, function: Callable[..., _Result], size: int, stopping: Callable[[], None]):
-        self._function, self._size, self._stopping = function, size, stopping
-        self._idle: list[_Worker] = []
-        self._busy: dict[Connection, tuple[_Worker, _Job]] = {}
-
-    def __enter__(self) -> "Pool[_Job, _Result]":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        busy = [worker for worker, _ in self._busy.values()]
-        workers = [*busy, *self._idle]
+    again, idle = deque[tuple[_Job, int]](), list[_Worker]()
+    under_way: dict[Future[_Result], tuple[_Worker, _Job, int]] = {}
+    try:
+        while True:
+            while len(under_way) < workers and (each := _next(again, next_job)):
+                worker = idle.pop() if idle else _Worker()
+                under_way[worker.submit(function, each[0])] = worker, *each
+            if not under_way:
+                return
+            for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                worker, job, attempt = under_way.pop(future)
+                if not worker.was_killed(future):
+                    idle.append(worker)
+                    yield job, future.result()
+                    continue
+                worker.end(kill=True)
+                if attempt < ATTEMPTS:
+                    again.append((job, attempt + 1))
+                else:
+                    yield job, None
+    finally:
+        busy = {future: worker for future, (worker, _, _) in under_way.items()}
         try:
-            for worker in busy:
-                worker.process.terminate()
-            for worker in workers:
-                worker.connection.close()
+            for worker in busy.values():
+                worker.ask_to_stop()
             if busy:
-                self._stopping()
-            deadline = time.monotonic() + _STOPPING_SECONDS
-            for worker in workers:
-                worker.process.join(max(deadline - time.monotonic(), 0))
+                stopping()
+                wait(busy, timeout=patience)
         finally:  # at once if this is interrupted, too
-            for worker in workers:
-                worker.process.kill()
-                worker.process.join()
+            _end(idle, busy)
 
-    @property
-    def is_full(self) -> bool:
-        """Whether every worker has a job."""
-        return len(self._busy) >= self._size
 
-    @property
-    def is_idle(self) -> bool:
-        """Whether no worker has a job."""
-        return not self._busy
-
-    def submit(self, job: _Job, *arguments: Any) -> None:
-        """Give a job to a worker."""
-        worker = self._idle.pop() if self._idle else _Worker()
-        self._busy[worker.connection] = worker, job
-        with suppress(OSError):  # it died: `result` notices
-            worker.connection.send((self._function, arguments))
-
-    def result(self) -> tuple[_Job, _Result | None]:
-        """Wait for a job to end: what it returned, or None if its worker died or was stopped.
-
-        Raises:
-            WorkerError: it raised an error.
-        """
-        connection = wait(list(self._busy))[0]
-        assert isinstance(connection, Connection)
-        worker, job = self._busy.pop(connection)
-        try:
-            result: _Result | WorkerError = connection.recv()
-        except (EOFError, OSError):
-            connection.close()
-            worker.process.join()
-            return job, None
-        self._idle.append(worker)
-        if isinstance(result, WorkerError):
-            raise result
-        return job, result
+def _next(
+    again: deque[tuple[_Job, int]], next_job: Callable[[], _Job | None]
+) -> tuple[_Job, int] | None:
+    """A job to begin, and the number of the attempt."""
+    if again:
+        return again.popleft()
+    job = next_job()
+    return None if job is None else (job, 1)
 
 
 class _Worker:
-    """A process, and the parent's end of the connection to it."""
+    """An executor of one process, so that it is known whose job a process takes along."""
 
     def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        with _without_script():
-            self.process.start()
-        theirs.close()
+        from joblib.externals import loky  # which takes a moment
+
+        self._read_by_process, self._connection = Pipe(duplex=False)
+        self._executor = loky.ProcessPoolExecutor(
+            1, initializer=_begin, initargs=(self._read_by_process,), env=_SINGLE_THREADED
+        )
+
+    def submit(self, function: Callable[[_Job], _Result], job: _Job) -> Future[_Result]:
+        """Give a job to the process."""
+        future = Future[_Result]()
+        try:
+            future = self._executor.submit(function, job)
+        except BrokenExecutor as error:  # it was killed meanwhile
+            future.set_exception(error)
+        return future
+
+    def was_killed(self, future: Future[Any]) -> bool:
+        """Whether a job ended as its process did."""
+        from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+        return isinstance(future.exception(), TerminatedWorkerError)
+
+    def ask_to_stop(self) -> None:
+        """Let `stop_requested` be true in the process."""
+        with suppress(OSError):  # it was killed meanwhile
+            self._connection.send(None)
+
+    def end(self, kill: bool) -> None:
+        """End the process, at once or when it has closed what it has open."""
+        self._executor.shutdown(kill_workers=kill)
+        self.leave()
+
+    def leave(self) -> None:
+        """Let the process end at once, as if this one had ended."""
+        self._connection.close()
 
 
-@contextmanager
-def _without_script() -> Iterator[None]:
-    """Keep a new process from running the script that this one runs: it may have no main guard."""
-    script = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = script
+def _end(idle: Iterable[_Worker], busy: Mapping[Future[Any], _Worker]) -> None:
+    """End processes side by side, those that still have a job at once."""
+    kill = dict.fromkeys(idle, False) | {busy[each]: not each.done() for each in busy}
+    ends = [threading.Thread(target=each.end, args=(kill[each],), daemon=True) for each in kill]
+    for end in ends:
+        end.start()
+    for end in ends:
+        end.join(_CLOSED_WITHIN)
+    for worker in kill:
+        worker.leave()
+
+
+def _begin(connection: Connection) -> None:
+    """Begin a process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which then asks
+    signal.signal(signal.SIGTERM, lambda number, frame: None)  # likewise
+    threading.Thread(target=_listen, args=(connection,), daemon=True).start()
+
+
+def _listen(connection: Connection) -> None:
+    """Note when the parent asks to stop; end this process at once when the parent has ended."""
+    with suppress(EOFError, OSError):
+        connection.recv()
+        _stop.set()
+        connection.recv()
+    os._exit(1)
 
 
 def stop_requested() -> bool:
-    """Whether this process is a worker that has been asked to stop."""
+    """Whether this process is one that has been asked to stop."""
     return _stop.is_set()
-
-
-def _serve(connection: Connection) -> None:
-    """Work on one job after the other, until the parent closes the connection."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which then asks
-    signal.signal(signal.SIGTERM, lambda number, frame: _stop.set())
-    os.environ.update(_SINGLE_THREADED)
-    with suppress(EOFError, OSError):
-        while True:
-            result = _result(connection)
-            if stop_requested():
-                return
-            connection.send(result)
-
-
-def _result(connection: Connection) -> Any:
-    """What the next job returns, or the error that it raises; a job may not even be readable."""
-    try:
-        function, arguments = connection.recv()
-    except (EOFError, OSError):  # the parent is gone
-        raise
-    except Exception as error:
-        return _told(error)
-    try:
-        return function(*arguments)
-    except Exception as error:
-        return _told(error)
-
-
-def _told(error: Exception) -> WorkerError:
-    traceback.print_exception(error)
-    return WorkerError(f"a worker failed: {type(error).__name__}: {error}")
-
-
-def _end_with_parent() -> None:
-    """End this process at once when its parent has ended; a run can be cut off anywhere."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def on_cluster(function: Callable[..., Any], cpus: int | None, gpus: int = 0) -> Any:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,18 +13,20 @@ import pytest
 from command import wait_for, wait_for_the_end_of, workers_of
 
 from jbrep.errors import InputError
-from jbrep.pool import Pool, on_cluster, stop_requested
+from jbrep.pool import on_cluster, side_by_side, stop_requested
 
 PARENT = """
 import sys
 sys.path[:0] = {tests!r}
-from test_pool import Pool, hang
+from test_pool import begun, hang
 if __name__ == "__main__":
-    with Pool(hang, 2, lambda: None) as pool:
-        pool.submit("a", {folder!r})
-        pool.submit("b", {folder!r})
-        pool.result()
+    next(begun(hang, [{folder!r}] * 2, 2))
 """
+
+
+def begun(function, jobs, workers, *given):
+    jobs = iter(jobs)
+    return side_by_side(function, lambda: next(jobs, None), workers, *given)
 
 
 def square(number):
@@ -39,11 +42,15 @@ def die(folder):
     return "survived"
 
 
-def kill_worker_of_first_run(name):
+def fail(what):
+    raise KeyError(what)
+
+
+def kill_worker_of_first_run(name, modules):
     """Used instead of `work`."""
-    if name == "first":
+    if name.name == "first":
         os.kill(os.getpid(), signal.SIGKILL)
-    return f"outcome of {name}"
+    return f"outcome of {name.name}"
 
 
 def hang(folder):
@@ -58,39 +65,55 @@ def never_stop(folder):
     time.sleep(600)
 
 
-def not_called():
-    raise AssertionError
+def sleep_after(seconds):
+    time.sleep(seconds)
+    return seconds, os.getpid()
 
 
-def test_jobs_come_back_under_their_names():
-    with Pool(square, 2, not_called) as pool:
-        pool.submit("three", 3)
-        assert not pool.is_full
-        pool.submit("four", 4)
-        assert pool.is_full
-        results = dict(pool.result() for _ in range(2))
-        assert {name: value for name, (value, _) in results.items()} == {"three": 9, "four": 16}
-        pool.submit("five", 5)
-        job, (value, process) = pool.result()
-        assert (job, value) == ("five", 25)
-        assert process in [worker for _, worker in results.values()]  # used again
-        assert pool.is_idle
-    wait_for_the_end_of([worker for _, worker in results.values()], seconds=60)
+def test_jobs_come_back_with_their_results():
+    results = dict(begun(square, range(5), 2))
+    assert {job: number for job, (number, _) in results.items()} == {n: n**2 for n in range(5)}
+    workers = {process for _, process in results.values()}
+    assert len(workers) <= 2  # used again
+    assert not workers_of(os.getpid())
 
 
-def test_the_job_of_a_dead_worker_is_named(tmp_path):
-    with Pool(die, 1, not_called) as pool:
-        for expected in (None, None, "survived"):
-            pool.submit("job", tmp_path)
-            assert pool.result() == ("job", expected)
+def test_jobs_are_taken_as_processes_become_free():
+    jobs, taken = iter([3.0, 0.0, 0.1]), []
+
+    def next_job():
+        taken.append(next(jobs, None))
+        return taken[-1]
+
+    with closing(side_by_side(sleep_after, next_job, 2)) as results:
+        assert next(results)[0] == 0.0
+        assert taken == [3.0, 0.0]
+        assert next(results)[0] == 0.1
+
+
+def test_the_job_of_a_dead_worker_is_tried_again(tmp_path):
+    assert list(begun(die, [tmp_path], 1)) == [(tmp_path, "survived")]
+    assert (tmp_path / "deaths").read_text() == "xxx"
+
+
+def test_the_error_of_a_worker_is_raised():
+    with pytest.raises(KeyError, match="what it lacks") as error:
+        list(begun(fail, ["what it lacks"], 1))
+    assert "in fail" in str(error.value.__cause__)  # its traceback
+
+
+def interrupted(folder):
+    """A job, and Ctrl-C when it is under way."""
+    yield folder
+    while not list(folder.iterdir()):
+        time.sleep(0.01)
+    raise KeyboardInterrupt
 
 
 def test_jobs_are_asked_to_stop_and_waited_for(tmp_path):
     said = []
-    with Pool(hang, 1, lambda: said.append("stopping")) as pool:
-        pool.submit("job", tmp_path)
-        while not list(tmp_path.iterdir()):
-            time.sleep(0.01)
+    with pytest.raises(KeyboardInterrupt):
+        list(begun(hang, interrupted(tmp_path), 2, 60, lambda: said.append("stopping")))
     assert (tmp_path / "stopped").exists()
     assert said == ["stopping"]
     assert not workers_of(os.getpid())
@@ -100,11 +123,9 @@ def test_an_interrupted_stop_ends_jobs_at_once(tmp_path):
     def interrupt():
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), Pool(never_stop, 1, interrupt) as pool:  # noqa: PT012
-        pool.submit("job", tmp_path)
-        while not list(tmp_path.iterdir()):
-            time.sleep(0.01)
-        started = time.monotonic()
+    started = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        list(begun(never_stop, interrupted(tmp_path), 2, 600, interrupt))
     assert time.monotonic() - started < 60
     assert not workers_of(os.getpid())
 
@@ -129,10 +150,9 @@ def test_a_run_that_kills_its_workers_crashes_alone(monkeypatch):
     from jbrep.study import runner
 
     monkeypatch.setattr(runner, "work", kill_worker_of_first_run)
-    monkeypatch.setattr(runner, "_job", lambda plan, cell: (cell.name,))
-    names = ("first", "second", "third", "fourth")
-    cells = [SimpleNamespace(name=name) for name in names]
-    *others, crashed = runner.on_this_machine(None, cells, 2)
+    plan = SimpleNamespace(assigned=lambda name: SimpleNamespace(name=name))
+    cells = ("first", "second", "third", "fourth")
+    *others, crashed = runner.on_this_machine(plan, cells, 2)
     assert sorted(others) == ["outcome of fourth", "outcome of second", "outcome of third"]
     assert (crashed.name, crashed.status) == ("first", "crashed")
     assert crashed.message.startswith("its worker was killed 5 times, perhaps because memory ran")

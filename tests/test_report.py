@@ -17,8 +17,7 @@ from made_up import make_runs, of_a_commit, write_record
 from small import adopt, forge
 
 from jbrep.encoders import find, save
-from jbrep.envs import describe
-from jbrep.errors import InputError
+from jbrep.errors import InputError, Notice
 from jbrep.evaluate.diagnosis import SCALARS
 from jbrep.evaluate.table import DIAGNOSTICS
 from jbrep.play.sources import find_episode
@@ -35,9 +34,12 @@ from jbrep.stats.rules import Rules
 from jbrep.study.config import Study, as_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.results import play_references, write_tables
 from jbrep.study.runner import register_study
-from jbrep.study.tables import REFERENCE_RETURNS, write_references
+from jbrep.study.tables import (
+    REFERENCE_RETURNS,
+    play_references,
+    write_tables,
+)
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 FINAL = {"full": 800, "dae-8": 300, "pca-8": 820}
@@ -107,8 +109,8 @@ def whole(tmp_path_factory, one_picture):
     """The folder of a study at its end, with one failed run, and its report."""
     folder = tmp_path_factory.mktemp("whole") / "a-study"
     make_study(folder, failed=(1,))
-    write_policies(folder, STUDY)
     write_tables(folder)
+    write_policies(folder, STUDY)
     write_report(found_in(folder), folder)
     return folder
 
@@ -124,7 +126,10 @@ def write_policies(folder, study):
         for policy, mean in zip(POLICIES, (250, 237, 100, 940), strict=True)
         for episode in range(study.final_episodes)
     ]
-    write_csv(folder / REFERENCE_RETURNS, ("task", "policy", "episode", "return"), rows)
+    columns = ("task", "policy", "episode", "return")
+    sha256 = write_csv(folder / REFERENCE_RETURNS, columns, rows)
+    record = read_document(folder / RECORD, RunsRecord)
+    record.with_table(REFERENCE_RETURNS, sha256).write(folder / RECORD)
 
 
 @pytest.fixture(scope="module")
@@ -136,8 +141,8 @@ def judged(tmp_path_factory):
     with of_a_commit():
         register_study(Plan(study, folder))
     make_runs(Plan(study, folder), study.seeds)
-    write_policies(folder, study)
     write_tables(folder)
+    write_policies(folder, study)
     return folder
 
 
@@ -375,7 +380,7 @@ def test_of_single_runs_it_shows_what_there_is(tmp_path):
 
 def test_a_report_plays_nothing(tmp_path, monkeypatch):
     """Of runs beside which nothing was played, it says what to do."""
-    monkeypatch.setattr("jbrep.study.tables.find_player", None)
+    monkeypatch.setattr("jbrep.study.tables.play", None)
     plan = make_study(tmp_path / "unplayed")
     monkeypatch.setattr(report, "study_plots", lambda found: [])
     made = make_report(plan.folder)
@@ -385,37 +390,64 @@ def test_a_report_plays_nothing(tmp_path, monkeypatch):
 
 
 def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkeypatch):
-    tasks = [(describe("face_direction", max_episode_steps=50), 2)]
-    sha256 = write_references(tasks, tmp_path, {})
-    path = tmp_path / REFERENCE_RETURNS
-    rows = list(csv.reader(path.read_text().splitlines()))
+    study = STUDY.replace(episode_steps=50)
+    plan = make_study(tmp_path, study=study)
+    write_tables(plan.folder)
+    play_references(plan.folder)
+    path = plan.folder / REFERENCE_RETURNS
+    before = path.read_bytes()
+    rows = list(csv.reader(before.decode().splitlines()))
     assert rows[0] == ["task", "policy", "episode", "return"]
     policies = {"standing still": "still", "constant drive": "constant:drive=0.75"}
     policies |= {"random": "uniform", "hand-written": "heuristic"}
-    assert [row[1] for row in rows[1:]] == [name for name in policies for _ in range(2)]
+    episodes = study.final_episodes
+    assert [row[1] for row in rows[1:]] == [name for name in policies for _ in range(episodes)]
+    task = plan.task("face_direction")
     for _, name, episode, played in rows[1:]:
-        alone = find_episode(policies[name], int(episode), tasks[0][0]).reward.sum()
+        alone = find_episode(policies[name], int(episode), task).reward.sum()
         assert float(played) == pytest.approx(alone, abs=1e-3)
-    monkeypatch.setattr("jbrep.study.tables.find_player", None)
-    assert write_references(tasks, tmp_path, {}) == sha256
-    monkeypatch.undo()
-    longer = tasks[0][0].replace(max_episode_steps=60)
-    assert write_references([(longer, 2)], tmp_path, {}, {longer.name: tasks[0][0]}) != sha256
-    assert write_references(tasks, tmp_path, {}, {longer.name: longer}) == sha256
-
-
-def test_references_that_were_changed_are_refused_until_a_study_plays_them_again(tmp_path):
-    plan = make_study(tmp_path / "it", study=STUDY.replace(episode_steps=20))
-    play_references(plan)
+    monkeypatch.setattr("jbrep.study.tables.play", None)
     write_tables(plan.folder)
-    path = plan.folder / REFERENCE_RETURNS
-    before = path.read_bytes()
+    play_references(plan.folder)
+    assert path.read_bytes() == before
     path.write_bytes(before.replace(b",1,", b",1,1"))
     with pytest.raises(InputError, match=r"references\.csv was changed"):
-        write_tables(plan.folder)
-    play_references(plan)
+        read_tables(plan.folder)
+    with pytest.warns(Notice), pytest.raises(InputError, match=r"references\.csv was changed"):
+        play_references(plan.folder)
+    monkeypatch.undo()
+    play_references(plan.folder)
     assert path.read_bytes() == before
+
+
+def test_references_of_another_task_are_forgotten(tmp_path):
+    plan = make_study(tmp_path / "it")
     write_tables(plan.folder)
+    write_policies(plan.folder, STUDY)
+    write_tables(plan.folder)
+    assert read_tables(plan.folder).references
+    record = json.loads((plan.folder / RECORD).read_text())
+    for label in record["labels"].values():
+        label["settings"]["environment"]["max_episode_steps"] += 1
+    forge(plan.folder / RECORD, record)
+    write_tables(plan.folder)
+    assert not read_tables(plan.folder).references
+
+
+def test_references_of_an_environment_that_is_not_here_stay(tmp_path, monkeypatch):
+    """Even of fewer episodes than are wanted."""
+
+    def away(policy, task, episodes):
+        raise InputError("it isn't here")
+
+    plan = make_study(tmp_path / "it")
+    write_tables(plan.folder)
+    write_policies(plan.folder, STUDY.replace(evaluation_episodes=1, final_episodes=1))
+    before = read_tables(plan.folder).references
+    monkeypatch.setattr("jbrep.study.tables.play", away)
+    with pytest.warns(Notice, match="couldn't be played on face_direction: it isn't here"):
+        play_references(plan.folder)
+    assert read_tables(plan.folder).references == before
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,6 @@ from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.make import make_env
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError
-from jbrep.pool import Pool, WorkerError
 from jbrep.rl import Run
 from jbrep.rl.files import read_run
 from jbrep.rl.run import estimate
@@ -447,15 +446,3 @@ def test_a_script_without_a_main_guard_collects_in_processes_if_they_can(tmp_pat
     assert len(told.stdout.split()) == 2
     here, there = (Dataset(tmp_path / name) for name in ("Here", "There"))
     np.testing.assert_array_equal(here["observation"][:], there["observation"][:])
-
-
-def fail(what):
-    raise KeyError(what)
-
-
-def test_the_error_of_a_worker_is_told(capfd):
-    with Pool(fail, 1, lambda: None) as pool:
-        pool.submit("job", "what it lacks")
-        with pytest.raises(WorkerError, match="a worker failed: KeyError: 'what it lacks'"):
-            pool.result()
-    assert "Traceback" in capfd.readouterr().err

@@ -31,7 +31,7 @@ from jbrep.rl.presets import sb3_class
 from jbrep.rl.settings import CLASSES
 from jbrep.study.config import as_study, read_study
 from jbrep.study.plan import Plan, read_plan
-from jbrep.study.results import write_tables
+from jbrep.study.tables import write_tables
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
 PINK = {"kind": "coloured", "beta": 1, "sigma": 0.2}

@@ -1,7 +1,6 @@
 """Studies: their files, preparation, workers, kills, clusters and results."""
 
 import csv
-import hashlib
 import json
 import os
 import shutil
@@ -30,7 +29,7 @@ from small import adopt, forge
 from jbrep.dataset import Dataset
 from jbrep.encoders import load
 from jbrep.envs import describe
-from jbrep.errors import DamageError, InputError, Notice
+from jbrep.errors import InputError
 from jbrep.play.sources import find_player, find_untrained
 from jbrep.report.findings import Findings
 from jbrep.report.report import results_text
@@ -41,14 +40,17 @@ from jbrep.stats.rules import Rules
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, as_study, read_study
 from jbrep.study.forecast import forecast
-from jbrep.study.plan import STUDY, Plan, read_plan
+from jbrep.study.plan import PROGRESS, STUDY, Plan, read_plan
 from jbrep.study.prepare import check, prepare
-from jbrep.study.record import runs_record
+from jbrep.study.record import RunsRecord
 from jbrep.study.representations import ByName
-from jbrep.study.results import read_runs, write_tables
-from jbrep.study.runner import Progress, on_this_machine, run_study
-from jbrep.study.tables import REFERENCE_RETURNS, RETURNS, read_references, write_references
-from jbrep.study.work import PROGRESS, Outcome, work
+from jbrep.study.runner import Outcome, Progress, on_this_machine, run_study, work
+from jbrep.study.tables import (
+    REFERENCE_RETURNS,
+    RETURNS,
+    read_curves,
+    write_tables,
+)
 
 ROOT = Path(__file__).parent.parent
 TINY = Study(
@@ -121,104 +123,51 @@ def test_a_study_from_toml(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("line", "message"),
+    ("line", "field"),
     [
-        ("task = 7", "unknown task: it must be one of steps, .*, tasks, algorithms"),
+        ("task = 7", "unknown task"),
         ('tasks = ["fly"]', "unknown task 'fly'"),
-        ('tasks = [".."]', "unknown task '..'"),
-        ('tasks = ["my_robots:Robot-v0"]', "only; elsewhere give the id alone, and --import"),
-        (
-            'tasks = ["Robots/Ant-v0", "Robots-Ant-v0"]',
-            "Robots/Ant-v0 and Robots-Ant-v0 would share a folder",
-        ),
-        ('algorithms = ["dqn"]', "unknown algorithm 'dqn'"),
+        ('tasks = ["Robots/Ant-v0", "Robots-Ant-v0"]', "share a folder"),
         ('algorithms = ["a2c-best"]', "unknown preset 'best'"),
-        *(
-            (
-                f'representations = ["full", "{name}"]',
-                f"unknown representation '{name}': it must be full, or a method",
-            )
-            for name in ("fit-8", "dae-wide-8", "pca", "pca-08", "pca-0", "pca-deep-8", "full-8")
-        ),
-        ('representations = ["full", "full"]', "representations is .*each once"),
-        ("seeds = []", r"seeds is \[\]"),
-        ("seeds = 0", r"seeds is 0"),
-        ("seeds = [0.5]", r"seeds\[0\] is 0.5"),
-        ("seeds = true", "seeds is True"),
-        ("seeds = [-1]", r"seeds\[0\] is -1"),
-        ("steps = 0", "steps is 0: it must be"),
-        ("learners = {}", "unknown 'learners': settings of an algorithm are in algorithms.NAME"),
-        (f"steps = {10**23}", "steps"),
-        ("steps = '80'", "steps is '80'"),
-        (
-            "evaluation_episodes = 5\nfinal_episodes = 2",
-            "final_episodes is 2: it must be as many as evaluation_episodes, 5, or more",
-        ),
-        ('domain = {delay = "2..0"}', r"delay is 2\.\.0: swap them"),
-        ("episode_steps = 1.5", "episode_steps is 1.5"),
-        ("environment = 7", "environment is 7"),
-        ("environment = {g = 1979-05-27}", "environment has a date, or a num"),
-        ("environment = {g = inf}", "environment has a date, or a num"),
-        ("data = 7", "data is 7"),
-        ("data = {rows = 7}", "unknown data.rows"),
-        ("data = {}", "data: it must have either steps"),
-        ('data = {folder = "it", sets = 2}', "sets is 2: it is left out where there is a folder"),
-        ("training = {epochs = 3}", r"\[data\] is missing"),
-        *(
-            (f"data = {{steps = 9}}\ntraining = {training}", message)
-            for training, message in [
-                ("{depth = 3}", "unknown training.depth: it must be one of epochs, "),
-                ("{latent = 3}", "unknown training.latent"),
-                ("{epochs = 'many'}", "training.epochs is 'many'"),
-                ("{epochs = 0}", "epochs"),
-                ("7", "training is 7"),
-            ]
-        ),
-        ("steps 80", "is not valid TOML"),
+        ('representations = ["full", "dae-wide-8"]', "unknown representation 'dae-wide-8'"),
+        ('representations = ["full", "full"]', "representations"),
+        ("seeds = 0", "seeds"),
+        ("seeds = [0.5]", "seeds"),
+        ("steps = '80'", "steps"),
+        ("evaluation_episodes = 5\nfinal_episodes = 2", "final_episodes"),
+        ('domain = {delay = "2..0"}', "delay"),
+        ("environment = {g = inf}", "environment"),
+        ("data = {rows = 7}", "data.rows"),
+        ('data = {folder = "it", sets = 2}', "sets"),
+        ("training = {epochs = 3}", "data"),
+        ("data = {steps = 9}\ntraining = {latent = 3}", "training.latent"),
+        ("steps 80", "TOML"),
     ],
 )
-def test_a_mistaken_study_is_refused(line, message, tmp_path):
+def test_a_mistaken_study_is_refused(line, field, tmp_path):
     path = written(tmp_path, line)
-    with pytest.raises(InputError, match=message) as error:
+    with pytest.raises(InputError, match=field) as error:
         read_study(path)
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
 
 
-def test_a_study_without_seeds_or_with_settings_of_no_encoder_is_refused():
-    with pytest.raises(InputError, match="seeds is missing"):
-        as_study({"tasks": ["face_direction"], "algorithms": ["a2c"], "representations": ["full"]})
-    with pytest.raises(InputError, match=r"unknown training\.depth"):
-        TINY.replace(representations=("full",), data={"": Data(steps=9)}, training={"depth": 3})
-
-
-@pytest.mark.parametrize("representations", [("pca-8",), ("full",)])
-def test_a_study_without_comparisons_says_so_first(representations, tmp_path, monkeypatch):
-    study = TINY.replace(representations=representations)
-    assert study.comparisons == 0
-    assert "compares nothing" in study.notices[0]
-    assert TINY.comparisons == 1
-    against = TINY.replace(representations=("pca-8", "pca-4"), verdicts=Rules(baseline="pca-4"))
-    assert (against.comparisons, against.baseline) == (1, "pca-4")
-    assert TINY.replace(representations=("pca-8", "pca-4")).baseline == "pca-8"
-    with pytest.raises(InputError, match=r"baseline is 'pca-9': it must be one of .*, full, pca-8"):
+def test_what_a_study_can_not_show_is_said_first(tmp_path, monkeypatch):
+    two = TINY.replace(representations=("pca-8", "pca-4"))
+    assert (two.baseline, two.replace(verdicts=Rules(baseline="pca-4")).baseline) == (
+        "pca-8",
+        "pca-4",
+    )
+    with pytest.raises(InputError, match=r"baseline is 'pca-9'"):
         TINY.replace(verdicts=Rules(baseline="pca-9"))
-    assert TINY.notices == [
-        "This study is exploratory: its report will give no verdicts, as its file has no "
-        "verdicts.claims.",
-        "Encoders that ship with jbrep: pca-8. Your own are tables with a file: {name = ..., "
-        "file = ...}.",
-    ]
+    assert "exploratory" in TINY.notices[0]
     few = TINY.replace(algorithms=("sac-wide",), seeds=(0,)).notices
-    assert few[0] == "This study compares nothing: it has one seed."
     assert few[1].startswith("sac-wide learns from step 25,600 on: ")
-    assert TINY.replace(data={"": Data(steps=1000)}).notices == TINY.notices[:1]
-    path = written(tmp_path, f"representations = {json.dumps(representations)}")
+    path = written(tmp_path, 'representations = ["full"]')
     monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
     assert "This study compares nothing: it has one" in told.stderr
     assert max(map(len, told.stderr.splitlines())) <= 80
-    assert "1.0 h" not in told.stdout
 
 
 def test_a_study_is_read_without_its_environments(tmp_path, monkeypatch):
@@ -344,7 +293,7 @@ def test_a_study_that_is_refused_changes_nothing(done, tmp_path):
 
 def test_other_runs_in_its_folder_draw_nothing(done):
     ended = {path.parent: read_run(path.parent) for path in done.folder.rglob(RUN)}
-    record = runs_record(done.folder, ended, {})
+    record = RunsRecord.of(done.folder, ended)
     assert record.draws_of("sac+learning_starts=120") == {}
 
 
@@ -450,8 +399,10 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     plan.write()
     finished, begun, *_ = plan.cells
     shutil.copytree(done.folder_of(finished), plan.folder_of(finished))
-    stop = iter((False, True)).__next__  # after its first rollout
-    assert work(plan.assigned(begun), stop) is None
+    with monkeypatch.context() as patch:
+        stop = iter((False, True)).__next__  # after its first rollout
+        patch.setattr("jbrep.study.runner.stop_requested", stop)
+        assert work(plan.assigned(begun)) is None
     assert (plan.folder_of(begun) / CHECKPOINT).exists()
     reported = jbrep("report", out, "--json")
     assert reported.exit_code == 0, reported.output
@@ -572,34 +523,6 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     assert "--import PACKAGE" in refused.stderr  # its file names no module
 
 
-def test_no_references_no_table_and_damaged_ones_are_named(tmp_path):
-    path, header = tmp_path / REFERENCE_RETURNS, "task,policy,episode,return\n"
-    assert write_references([], tmp_path, {}) is None
-    assert read_references(tmp_path, None) == {}
-    path.write_text(header + "a,b,0,x\n")
-    with pytest.raises(DamageError, match=r"references\.csv is damaged or cut short"):
-        read_references(tmp_path, hashlib.sha256(path.read_bytes()).hexdigest())
-
-
-def test_references_of_an_environment_that_is_not_here_stay(tmp_path):
-    """Even of fewer episodes than are wanted; they can't be made again where they are damaged."""
-    path, header = tmp_path / REFERENCE_RETURNS, "task,policy,episode,return\n"
-    away = describe("face_direction").replace(id="Away/Robot-v0", name="Away/Robot-v0")
-    path.write_text(header + "Away/Robot-v0,random,0,1.0\n")
-    before = path.read_bytes()
-    with pytest.warns(Notice, match="couldn't be played on Away/Robot-v0: "):
-        sha256 = write_references([(away, 2)], tmp_path, {})
-    assert path.read_bytes() == before
-    assert read_references(tmp_path, sha256) == {"Away/Robot-v0": {"random": [1.0]}}
-    path.write_text(header + "Away/Robot-v0,random,0,2.0\n")
-    with (
-        pytest.warns(Notice, match="couldn't be played"),
-        pytest.raises(DamageError, match=r"references\.csv was changed"),
-    ):
-        write_references([(away, 2)], tmp_path, {REFERENCE_RETURNS: sha256})
-    assert path.exists()
-
-
 def test_one_study_at_a_time(done):
     from jbrep.records.lock import exclusive
 
@@ -628,12 +551,12 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
     if name != RUN:
         adopt(tmp_path / RUN, name)
     with pytest.raises(InputError, match=message):
-        read_runs(tmp_path)
+        read_curves(tmp_path)
 
 
 def test_a_folder_without_runs_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no finished run below .* train one with jbrep rl"):
-        read_runs(tmp_path)
+        read_curves(tmp_path)
 
 
 def test_a_run_is_played_before_and_after_training_with_another_body(done):

@@ -16,7 +16,7 @@ from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.rl.policy_file import shipped_file
 from jbrep.study.config import Data, as_study
-from jbrep.study.forecast import costs
+from jbrep.study.forecast import made_first
 from jbrep.study.plan import Plan
 from jbrep.study.prepare import check, prepare
 
@@ -223,23 +223,17 @@ def test_named_data_may_come_later_but_not_change(made):
         Plan(STUDY.replace(data=other), made.folder).check_folder()
 
 
-def test_what_is_made_first_is_estimated(made, tmp_path):
-    """What is there counts as done, and costs nothing; more steps and epochs cost more."""
-    there = {each.what: each[1:] for each in costs(made)}
+def test_what_is_made_first_is_counted(made, tmp_path):
+    there = {each.what: each[1:] for each in made_first(made)}
     assert there == {
-        **{"data.apart": (0, 2, 0), "data.mixed": (0, 4, 0)},
-        **{"full": (0, 2, 0), "pca-4": (0, 2, 0), "late": (0, 4, 0)},
+        **{"data.apart": (0, 2), "data.mixed": (0, 4)},
+        **{"full": (0, 2), "pca-4": (0, 2), "late": (0, 4)},
     }
     codes = ("full", {"name": "dae-2", "encoders": 2})
-    data = {"": Data(steps=200_000, policy=MIXTURE)}
-    study = TINY.replace(representations=codes, training={"epochs": 200}, data=data)
-    large = Plan(study, tmp_path / "none")
-    cost = {each.what: each for each in costs(large)}
-    assert {name: each.to_go for name, each in cost.items()} == {"data": 2, "full": 1, "dae-2": 2}
-    assert min(each.seconds for each in cost.values()) > 0
-    assert cost["data"].seconds > 1
-    assert cost["dae-2"].seconds > 10 * cost["full"].seconds
-    assert not large.folder.exists()
+    study = TINY.replace(representations=codes, data={"": Data(steps=200_000, policy=MIXTURE)})
+    none = Plan(study, tmp_path / "none")
+    assert [*made_first(none)] == [("data", 2, 0), ("full", 1, 0), ("dae-2", 2, 0)]
+    assert not none.folder.exists()
 
 
 def test_a_dry_run_shows_what_is_made_first(tmp_path, monkeypatch):

@@ -20,9 +20,8 @@ from jbrep.report.views import verdict_cells
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD
-from jbrep.study.results import play_references, write_tables
 from jbrep.study.runner import register_study
-from jbrep.study.tables import REFERENCE_RETURNS
+from jbrep.study.tables import REFERENCE_RETURNS, play_references, write_tables
 
 DOCS = Path(__file__).parent.parent / "docs" / "verdicts.md"
 
@@ -40,8 +39,8 @@ def reports(tmp_path_factory):
             plan = Plan(STUDY.replace(seeds=tuple(range(max(seeds, SEEDS)))), folder)
             plan.write()
             make_runs(plan, range(seeds))
-            play_references(plan)
             write_tables(folder)
+            play_references(folder)
             tables = read_tables(folder)
             _, page, text, *_ = write_report(Findings.of(tables), folder)
             found[seeds] = tables.analysis, page.read_text(), text.read_text()

@@ -25,8 +25,8 @@ from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method, name_of
 from jbrep.records.document import read_document
 from jbrep.records.tables import write_text
+from jbrep.report.diagnostics import evaluated
 from jbrep.report.evaluation import evaluation_text
-from jbrep.study.tables import evaluated
 
 SHIPPED = Path(__file__).parent.parent / "jbrep" / "encoders" / "shipped"
 SIZES = (12, 8, 4)

@@ -20,7 +20,7 @@ from jbrep.rl.files import EPISODES, FINISHED, last_returns, read_evaluations, r
 from jbrep.rl.policy import load_run, pack
 from jbrep.rl.policy_file import COLUMNS, FOLDER, RETURNS, SHIPPED, Returns, shipped, shipped_file
 from jbrep.stats.scale import LOOKING, STILL
-from jbrep.study.tables import REFERENCE_RETURNS, References, read_references, table_hashes
+from jbrep.study.tables import References, read_tables
 
 COUNTED = 100  # episodes
 LAST = 64  # episodes of training, one of each robot
@@ -49,7 +49,7 @@ def main() -> None:
     played: dict[str, Returns] = {each.task: each.returns for each in shipped()}
     beside = References()
     for folder in folders:
-        beside |= read_references(folder, table_hashes(folder)[REFERENCE_RETURNS])
+        beside |= read_tables(folder).references
     for task, (value, run) in best(folders).items():
         learned = last_returns(read_evaluations(run))
         written, still = beside[task][LOOKING], beside[task][STILL]

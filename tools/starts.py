@@ -17,12 +17,12 @@ from typing import NamedTuple
 import pandas as pd
 from joblib import cpu_count
 
+from jbrep.play import references
 from jbrep.play.sources import find_player
 from jbrep.progress import Progress
 from jbrep.rl.files import RunRecord, read_run, runs_below
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within, share_of_gain
 from jbrep.stats.scale import best_blind
-from jbrep.study.tables import references_of
 from jbrep.text import interval, table
 from jbrep.training.trainer import single_torch_thread
 
@@ -61,8 +61,9 @@ def play(runs: dict[Path, RunRecord], out: Path, starts: int) -> pd.DataFrame:
     ]
     if not rows:
         task = next(iter(runs.values())).settings.environment
-        for policy, returns in references_of(task, starts).items():
-            rows += [Start(policy, None, i, float(value)) for i, value in enumerate(returns)]
+        for policy in references.policies_of(task):
+            returns = enumerate(references.play(policy, task, starts))
+            rows += [Start(policy, None, episode, value) for episode, value in returns]
     with ProcessPoolExecutor(cpu_count()) as pool, Progress(total=len(missing), unit="run") as bar:
         for each in pool.map(played, missing, [starts] * len(missing)):
             rows += each

@@ -29,6 +29,7 @@ def _rl(
         from jbrep.encoders.shipped import source_of
         from jbrep.envs.infos import shares_text
         from jbrep.envs.make import is_one_robot
+        from jbrep.play.references import beside
         from jbrep.rl.files import EVALUATIONS, last_infos, read_evaluations, read_infos
 
         with _told_when_stopped(received, f"; {RESUMES}" if task.reproducible else ""):

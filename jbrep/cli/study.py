@@ -72,7 +72,7 @@ def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> N
     """Say what a study is going to do, or write it down before the first run."""
     from jbrep.study import Plan, read_study, register_study
     from jbrep.study.forecast import forecast
-    from jbrep.study.registration import registration_in
+    from jbrep.study.plan import registration_in
 
     plan = Plan(read_study(path), folder, path)
     expected = forecast(plan, workers) if dry_run else None
@@ -102,10 +102,9 @@ def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
         "time of each": lambda item: duration(max(item[1])),
     }
     made_first: Cells = {
-        "made first": lambda cost: cost.what,
-        "to go": lambda cost: str(cost.to_go),
-        "done": lambda cost: str(cost.done),
-        "time on one core": lambda cost: duration(cost.seconds),
+        "made first": lambda each: each.what,
+        "to go": lambda each: str(each.to_go),
+        "done": lambda each: str(each.done),
     }
     prospects: Cells = {
         "on": lambda each: each.where,

@@ -2,9 +2,11 @@
 
 import math
 import pickle
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -18,10 +20,11 @@ from jbrep.envs.names import import_modules, imported_modules, spec_of
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, first_line
 from jbrep.machine import cores
-from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
+from jbrep.pool import ATTEMPTS, on_cluster, side_by_side, stop_requested
 
 _PIECES = 10  # of a shard: what a worker makes at a time
 _AHEAD = 4  # pieces for each worker, begun or held until those before are made
+_PATIENCE = 60.0  # seconds, until pieces under way have stopped
 Made = list[Columns | InputError]  # episodes, and what ended them early
 
 
@@ -74,28 +77,26 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
         if not growth.wants((growth.episodes // each + 1) * each):  # one shard alone
             yield from simulator.in_turn(growth, tick)
             return
-        ahead, made, attempts = _Ahead(growth), dict[range, Made](), Counter[range]()
+        ahead, made = _Ahead(growth), dict[range, Made]()
         known = imported_modules(), spec_of(simulator.settings.task)
         close_kept()  # the workers have their own
-        with Pool[range, Made](make_episodes, workers, lambda: None) as pool:
-            while True:
-                while not pool.is_full and (coming := ahead.next(_AHEAD * workers)):
-                    pool.submit(coming, known, simulator, coming)
-                    ahead.waiting.append(coming)
-                if ahead.waiting[0] in made:
-                    yield from _whole(made.pop(ahead.waiting.popleft()))
-                    continue
-                piece, result = pool.result()
-                if result is not None:
-                    made[piece] = result
-                    continue
-                attempts[piece] += 1
-                if attempts[piece] == ATTEMPTS:
+
+        def next_piece() -> range | None:
+            if coming := ahead.next(_AHEAD * workers):
+                ahead.waiting.append(coming)
+            return coming
+
+        make = partial(make_episodes, known, simulator)
+        with closing(side_by_side(make, next_piece, workers, _PATIENCE)) as pieces:
+            for piece, result in pieces:
+                if result is None:
                     raise InputError(
                         f"the worker that began with episode {piece.start} was killed "
                         f"{ATTEMPTS} times, perhaps because memory ran out: try fewer --threads"
                     )
-                pool.submit(piece, known, simulator, piece)
+                made[piece] = result
+                while ahead.waiting and ahead.waiting[0] in made:
+                    yield from _whole(made.pop(ahead.waiting.popleft()))
 
     return produce
 

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import FULL
 from jbrep.encoders.base import OWN
 from jbrep.envs.infos import shares
@@ -378,11 +379,15 @@ def _scaling(labels: Sequence[Label]) -> Scaling | None:
     if not full:
         return None
     ways = {
-        RUNNING if each.settings.hyperparameters.normalize else each.encoder.shown.scaling
+        RUNNING
+        if each.settings.hyperparameters.normalize
+        else each.encoder.training.get("scaling", EXTREMA)
         for each in full
     }
     states, of_codes = (
-        sorted({e.encoder.shown.train_rows or 0 for e in labels if (e in full) == is_full} - {0})
+        sorted(
+            {e.encoder.data.get("train_rows") or 0 for e in labels if (e in full) == is_full} - {0}
+        )
         for is_full in (True, False)
     )
     return Scaling(ways=sorted(ways), states=states, of_codes=of_codes)
@@ -395,8 +400,8 @@ def _encoder(shared: Label) -> dict[str, Any]:
     return {
         "encoder": encoder.name,
         "layers": " - ".join((str(encoder.size), *layers, *own)),
-        "held-out error": encoder.shown.held_out_mse,
-        "training states": encoder.shown.train_rows,
+        "held-out error": encoder.metrics.get("held_out_mse"),
+        "training states": encoder.data.get("train_rows"),
         "SHA-256": shared.settings.encoder,
     }
 

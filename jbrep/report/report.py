@@ -14,12 +14,12 @@ from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, make_folder, write_whole
 from jbrep.report import views
+from jbrep.report.diagnostics import add_diagnostics
 from jbrep.report.figures import Plot, study_plots, write
 from jbrep.report.figures.panels import PAGE as WHOLE
 from jbrep.report.findings import Findings
-from jbrep.report.tables import Tables, check_tables, read_tables
-from jbrep.study.results import has_runs, write_tables
-from jbrep.study.tables import Return, add_diagnostics
+from jbrep.report.tables import Tables, read_tables
+from jbrep.study.tables import Return, check_tables, has_runs, write_tables
 from jbrep.text import html, terminal_width
 
 FINDINGS, PAGE, MARKDOWN, FIGURES = "findings.json", "report.html", "summary.md", "figures"
@@ -68,7 +68,7 @@ def make_report(
     """Write the tables of the runs below a folder, if there are any, and the report of the tables.
 
     Into `out`, or the same folder, which another process that reports there is waited for.
-    Evaluations are those of `jbrep.study.tables.add_diagnostics`.
+    Evaluations are those of `add_diagnostics`.
     """
     out, ran = out or folder, has_runs(folder)
     if not ran:

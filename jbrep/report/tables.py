@@ -1,26 +1,20 @@
-"""The tables that a report is made from, read back from a study's folder, and their statistics."""
+"""What a report is made from: the tables of a study, and the statistics of their runs."""
 
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from jbrep.errors import InputError
-from jbrep.evaluate.table import DIAGNOSTICS, by_label, read_diagnostics
-from jbrep.records.document import read_document
-from jbrep.records.storage import exists
-from jbrep.records.tables import read_rows
-from jbrep.rl.files import ENCODER
-from jbrep.stats import Analysis
-from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.results import found
-from jbrep.study.tables import (
-    REFERENCE_RETURNS,
-    RETURNS,
-    RUN_INFOS,
-    References,
-    Return,
-    RunInfo,
-    read_references,
-)
+from jbrep.errors import InputError, listed
+from jbrep.evaluate.table import by_label
+from jbrep.report.diagnostics import read_known
+from jbrep.stats import Analysis, RunCurve, analyse
+from jbrep.stats.curves import common_grid
+from jbrep.stats.runs import groups
+from jbrep.stats.scale import BLIND
+from jbrep.study import tables as study
+from jbrep.study.record import RunsRecord
+from jbrep.study.tables import References, Return, RunInfo
 
 
 class Tables(NamedTuple):
@@ -37,30 +31,74 @@ class Tables(NamedTuple):
     left_out: list[str]  # what there are no statistics of, and why
 
 
-def check_tables(folder: Path) -> None:
-    """Make sure that a folder has the tables of a study."""
-    if not exists(folder / RECORD):
-        if any(folder.rglob(ENCODER)):
-            raise InputError(f"no run in {folder} has ended yet: report them then")
-        raise InputError(
-            f"{folder} is not the folder of a study: it has neither runs nor a {RECORD}"
-        )
-
-
 def read_tables(folder: Path) -> Tables:
-    """The tables in a folder, with statistics if they allow any.
-
-    Args:
-        folder: of a study, or any that `jbrep.study.results.write_tables` wrote tables into.
-    """
-    check_tables(folder)
-    record = read_document(folder / RECORD, RunsRecord)
-    sha256 = record.tables
-    returns = read_rows(folder / RETURNS, Return, sha256.get(RETURNS, ""))
-    references = read_references(folder, sha256.get(REFERENCE_RETURNS))
-    told, known = sha256.get(RUN_INFOS), sha256.get(DIAGNOSTICS)
-    infos = read_rows(folder / RUN_INFOS, RunInfo, told) if told else []
-    rows = read_diagnostics(folder / DIAGNOSTICS, known) if known else []
-    statistics = found(record, returns, references)
+    """The tables in a folder of a study, or of any runs, with statistics if they allow any."""
+    tables = study.read_tables(folder)
     name = folder.resolve().name.encode(errors="replace").decode()
-    return Tables(name, record, returns, infos, references, by_label(rows), *statistics)
+    diagnostics = by_label(read_known(folder, tables.record))
+    return Tables(name, *tables, diagnostics, *_statistics(tables))
+
+
+def _statistics(tables: study.Tables) -> tuple[Analysis | None, list[str]]:
+    """The statistics, if runs allow any; what there are none of, and why."""
+    prevented = _prevented(tables.record, tables.references)
+    planned = replace(tables.record.planned, prevented=prevented)
+    compared, left_out = _comparable(tables.curves(), planned.rules.baseline)
+    compared, refused = _without_refused(compared, planned.rules.baseline)
+    left_out += refused
+    try:
+        references = tables.references
+        analysis = analyse(compared, planned, references=references) if compared else None
+        return analysis, left_out
+    except InputError as error:
+        return None, [*left_out, str(error)]
+
+
+def _comparable(runs: list[RunCurve], baseline: str) -> tuple[list[RunCurve], list[str]]:
+    """The runs that there can be statistics of, though others are missing; what is left out."""
+    counts = Counter((run.task, run.algorithm, run.representation) for run in runs)
+    alone = {
+        key: f"{'/'.join(key)}: one run has ended, at least two are needed"
+        for key, count in counts.items()
+        if count == 1
+    }
+    alone |= {
+        key: f"{'/'.join(key)}: at least two runs of {baseline} are needed to compare it with"
+        for key in counts
+        if counts[*key[:2], baseline] < 2 and key not in alone
+    }
+    kept = [run for run in runs if (run.task, run.algorithm, run.representation) not in alone]
+    return kept, sorted(alone.values())
+
+
+def _without_refused(runs: list[RunCurve], baseline: str) -> tuple[list[RunCurve], list[str]]:
+    """The runs of tasks and algorithms that there can be statistics of; why not of the others."""
+    by_group: dict[tuple[str, str], list[RunCurve]] = {}
+    for run in runs:
+        by_group.setdefault((run.task, run.algorithm), []).append(run)
+    kept, refused = list[RunCurve](), []
+    for some in by_group.values():
+        try:
+            for group in groups(some, baseline).values():
+                common_grid(group)
+            kept += some
+        except InputError as error:
+            refused.append(str(error))
+    return kept, refused
+
+
+def _prevented(record: RunsRecord, references: References) -> dict[str, str]:
+    """Why there are no verdicts on tasks, by name, where what scores 0 or 1 isn't known."""
+    named = record.planned.rules.reference
+    needed = (*BLIND, named) if isinstance(named, str) and named else BLIND
+    tasks = {record.settings_of(run).task for run in record.runs}
+    unknown = {
+        task: [policy for policy in needed if policy not in references.get(task, {})]
+        for task in tasks
+    }
+    return {
+        task: f"what {listed(policies)} would return isn't known, by which returns are scored: "
+        "jbrep study plays them when it runs"
+        for task, policies in unknown.items()
+        if policies
+    }

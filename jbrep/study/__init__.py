@@ -3,8 +3,8 @@
 from jbrep.stats.rules import Rules
 from jbrep.study.config import Data, Study, read_study
 from jbrep.study.plan import Plan
-from jbrep.study.results import write_tables
 from jbrep.study.runner import register_study, run_study
+from jbrep.study.tables import write_tables
 
 __all__ = [
     "Data",

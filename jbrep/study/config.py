@@ -113,10 +113,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
 
     tasks: Annotated[
         tuple[str, ...],
-        Meta(
-            min_length=1,
-            description="The Jitterbug's by name, others by their Gymnasium ids.",
-        ),
+        Meta(min_length=1, description="The Jitterbug's by name, others by their Gymnasium ids."),
     ]
     algorithms: Annotated[
         tuple[str, ...],
@@ -134,13 +131,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             "settings, or encoders.",
         ),
     ]
-    seeds: Annotated[
-        tuple[Seed, ...],
-        Meta(
-            min_length=1,
-            description="Of the runs, or how many.",
-        ),
-    ]
+    seeds: Annotated[tuple[Seed, ...], Meta(min_length=1, description="Of the runs, or how many.")]
     episode_steps: Annotated[
         Annotated[int, Meta(ge=1, le=MAX_EPISODE_STEPS)] | None,
         Meta(description="The time limit.", extra={"default": "each task's own"}),
@@ -310,11 +301,8 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         named = {each.name: each for each in self.observed}
         found = {}
         for claim in self.verdicts.stated:
-            sides = [
-                [named[name].encoder_seed(seed) for seed in self.seeds]
-                for name in (claim.x, claim.y)
-            ]
-            linked = len(linked_units(sides))
+            sides = (named[claim.x], named[claim.y])
+            linked = len(linked_units([[*map(each.encoder_seed, self.seeds)] for each in sides]))
             found[claim] = linked if linked >= FEWEST_UNITS else len(self.seeds)
         return found
 
@@ -327,11 +315,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     def observed(self) -> tuple[Representation, ...]:
         """What agents observe."""
         return tuple(read_representation(each, self.training) for each in self.representations)
-
-    @property
-    def comparisons(self) -> int:
-        """How many times a representation is compared with the baseline."""
-        return len(self.tasks) * len(self.algorithms) * (len(self.observed) - 1)
 
     def flat(self) -> dict[str, Any]:
         """Its settings, those of each learner under algorithms.NAME, as in its file."""
@@ -363,33 +346,22 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             for each in self.observed
             if len(set(each.shares(self.seeds))) > 1
         ]
-        if not self.comparisons:
+        if len(self.observed) == 1:
             lines.append("This study compares nothing: it has one representation.")
         elif len(self.seeds) == 1:
             lines.append("This study compares nothing: it has one seed.")
-        elif not self.verdicts.claims:
+        elif not self.has_claims:
             lines.append(
                 "This study is exploratory: its report will give no verdicts, as its file has no "
                 "verdicts.claims."
             )
-        for name in self.algorithms:
-            learner = self.learner(name)
+        for learner in map(self.learner, self.algorithms):
             first = learns_from(learner.algorithm, learner.hyperparameters)
             if self.steps <= first:
                 lines.append(
-                    f"{name} learns from step {first:,} on: {self.steps:,} steps leave its "
+                    f"{learner.name} learns from step {first:,} on: {self.steps:,} steps leave its "
                     "policies as they were drawn."
                 )
-        shipped = [
-            each.name
-            for each in self.observed
-            if isinstance(each, ByName) and not self.data and each.name not in UNLEARNED
-        ]
-        if shipped:
-            lines.append(
-                f"Encoders that ship with jbrep: {', '.join(shipped)}. Your own are tables with a "
-                "file: {name = ..., file = ...}."
-            )
         return lines
 
 

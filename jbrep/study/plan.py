@@ -1,32 +1,39 @@
-"""A study's folder: where its files are, and which runs it has."""
+"""A study in its folder: where its files are, which runs it has, and what was registered."""
 
-from collections.abc import Collection
+import hashlib
+import json
+from collections.abc import Collection, Iterable, Mapping, Set
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cached_property
 from itertools import product
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.envs.description import describe
 from jbrep.envs.task import Task
-from jbrep.errors import InputError, differences
-from jbrep.records.commit import in_work_tree
-from jbrep.records.document import read_document
-from jbrep.records.record import to_plain
-from jbrep.records.storage import exists, make_folder
+from jbrep.errors import DamageError, InputError, differences
+from jbrep.records.commit import CHANGES, commits, in_work_tree, is_committed
+from jbrep.records.document import Document, document_from, parse_json, read_document
+from jbrep.records.record import Version, from_plain, to_plain
+from jbrep.records.storage import exists, make_folder, read_file
 from jbrep.rl import Run
 from jbrep.rl.files import RUN, RunRecord
 from jbrep.rl.learner import Learner
+from jbrep.rl.training import packages
 from jbrep.study.config import Study
-from jbrep.study.registration import REGISTRATION, Registration, read_registration
 from jbrep.study.representations import ByName, Representation
-from jbrep.study.work import Assigned
 from jbrep.text import slug
 from jbrep.training.trainer import get_device
 
 STUDY = "study.json"
+REGISTRATION = "registration.json"
+PROGRESS = "progress"  # of a run under way: its steps, and the mean return of its last evaluation
+_SEAL = "sha256"
 _GRID = (  # may change
     "tasks",
     "algorithms",
@@ -36,6 +43,154 @@ _GRID = (  # may change
     "title",
 )
 _GRID_TABLES = "algorithms.", "data."
+
+
+class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
+    """registration.json, beside a study's file and in its folder."""
+
+    format = "jbrep registration"
+    format_version = 3
+
+    study: dict[str, Any]  # as it was written
+    encoders: dict[str, str]  # SHA-256 of those that are there beforehand, by the name of the run
+    policies: dict[str, str] = {}  # SHA-256 of those that collect data, by file, see `Plan`
+    data: dict[str, str] = {}  # fingerprints of those that are there beforehand, by folder
+    date: str  # ISO 8601, in UTC
+    versions: dict[Version, Version]  # by package
+    commits: dict[str, str]
+    committed: bool = True  # before the first run; False where no git would have it
+
+    def check(self) -> None:
+        _ = self.registered
+
+    @cached_property
+    def registered(self) -> Study:
+        """The study."""
+        return from_plain(self.study, Study, "study")
+
+    @cached_property
+    def sha256(self) -> str:
+        """SHA-256 of its fields, as canonical JSON: its file has it, so that changes are seen."""
+        return seal(to_plain(self))
+
+    def as_json(self) -> dict[str, Any]:
+        return {**super().as_json(), _SEAL: self.sha256}
+
+    def differences(self, study: Study) -> str:
+        """How a study differs from the registered one, but for its title and added seeds."""
+        kept = [seed for seed in study.seeds if seed in self.registered.seeds]
+        now = {**study.flat(), "seeds": kept, "title": self.registered.title}
+        return differences(self.registered.flat(), now)
+
+    def deviations(
+        self,
+        study: Study,
+        runs: Collection[RunRecord],
+        policies: Mapping[str, str],
+        data: Mapping[str, str],
+    ) -> list[str]:
+        """How what ran differs from what was registered, in sentences.
+
+        Args:
+            study: its settings now.
+            runs: all that have ended.
+            policies: SHA-256 of those that collected data, by file.
+            data: fingerprints of those that the study doesn't make, by folder.
+        """
+        found = [] if self.committed else ["its registration is in no commit"]
+        if differing := self.differences(study):
+            found.append(f"settings differ: {differing}")
+        if added := [seed for seed in study.seeds if seed not in self.registered.seeds]:
+            found.append(f"seeds were added, whose runs are exploratory: {_listed(added)}")
+        if strays := [run for run in runs if run.settings.registration != self.sha256]:
+            found.append(f"{len(strays)} of its runs weren't made under this registration")
+        used = {run.settings.name: run.settings.encoder for run in runs}
+        if other := _others(used, used | self.encoders):
+            found.append(f"{len(other)} of its runs have other encoders than were registered")
+        for name, version in self.versions.items():
+            if others := {run.versions.get(name, "none") for run in runs} - {version}:
+                found.append(f"{name} was {_listed(sorted(others))}, not {version}")
+        found += self._other_code({run.commits.get("jbrep") for run in runs})
+        if other := _others(policies, self.policies):
+            found.append(f"other policies than were registered collected data: {_listed(other)}")
+        if other := _others(data, self.data):
+            found.append(f"data are others than were registered: {_listed(other)}")
+        return found
+
+    def _other_code(self, ran: Set[str | None]) -> list[str]:
+        """How the code that ran, by its commits, differs from that which was registered."""
+        registered = self.commits.get("jbrep")
+        every = {registered, *ran}
+        if any(each.endswith(CHANGES) for each in every if each):
+            return ["jbrep's code had changes that are in no commit, so it can't be compared"]
+        if every == {registered}:
+            return []
+        if None in every:
+            return ["some of jbrep's code was of no known commit, so it can't be compared"]
+        return ["some runs were made by other commits of jbrep's code"]
+
+
+def _others(hashes: Mapping[str, str], registered: Mapping[str, str]) -> list[str]:
+    """The names whose hashes aren't those that were registered."""
+    return [name for name, each in hashes.items() if registered.get(name) != each]
+
+
+def seal(fields: Mapping[str, Any]) -> str:
+    """SHA-256 of plain JSON in its canonical form."""
+    canonical = json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def registration_in(path: Path) -> Registration:
+    """What a file says.
+
+    Raises:
+        DamageError: the file was changed since it was written, or is damaged.
+    """
+    given = parse_json(read_file(path), path, Registration.format)
+    stated = given.pop(_SEAL, None)
+    found = document_from(given, path, Registration)
+    if stated != found.sha256:
+        raise DamageError(
+            f"{path} was changed after it was written, or is damaged: its checksum doesn't match"
+        )
+    return found
+
+
+def beside(file: Path) -> Path:
+    """Where the registration of a study's file is."""
+    return file.with_name(f"{file.stem}.{REGISTRATION}")
+
+
+def find_committed(file: Path, study: Study) -> Registration | None:
+    """The registration beside a study's file; None where there is none and needs to be none."""
+    path, in_git = beside(file), in_work_tree(file)
+    if not exists(path) and not (in_git and study.has_claims):
+        return None
+    if in_git and not is_committed(path):
+        state = "isn't as in the last commit" if exists(path) else "is missing"
+        raise InputError(
+            f"{path} {state}: register the study with --register, commit that file, then run it"
+        )
+    found = registration_in(path)
+    if differing := found.differences(study):
+        raise InputError(
+            f"{path} is of another study than {file}: {differing}; register it with --register, "
+            "commit that file, then run it"
+        )
+    return found
+
+
+def _listed(values: Iterable[object]) -> str:
+    return ", ".join(map(str, values))
+
+
+class Assigned(NamedTuple):
+    """A run for a worker."""
+
+    name: str
+    run: Run
+    folder: Path  # of this run alone
 
 
 @dataclass(frozen=True)
@@ -83,7 +238,8 @@ class Plan:
     @cached_property
     def registration(self) -> Registration | None:
         """What was written down before the first run; None if nothing was."""
-        return read_registration(self.folder)
+        path = self.folder / REGISTRATION
+        return registration_in(path) if exists(path) else None
 
     @property
     def in_git(self) -> bool:
@@ -99,14 +255,17 @@ class Plan:
         """A run's folder."""
         return self.folder / "runs" / cell.name
 
-    def has_ended(self, cell: Cell) -> bool:
-        """Whether a run has finished or failed."""
-        return exists(self.folder_of(cell) / RUN)
+    def progress(self, cell: Cell) -> tuple[int, str]:
+        """The steps that a run has done, and the mean return of its last evaluation as text."""
+        with suppress(InputError, ValueError):
+            step, mean = read_file(self.folder_of(cell) / PROGRESS).decode().split()
+            return int(step), mean
+        return 0, "-"
 
     @property
     def unfinished(self) -> list[Cell]:
         """The runs that have neither finished nor failed."""
-        return [cell for cell in self.cells if not self.has_ended(cell)]
+        return [cell for cell in self.cells if not exists(self.folder_of(cell) / RUN)]
 
     def task(self, name: str) -> Task:
         """A task with the study's arguments, time limit and domain."""
@@ -166,10 +325,7 @@ class Plan:
         """How what ran differs from what was registered, in sentences; none if nothing was."""
         if self.registration is None:
             return []
-        return [
-            *self.registration.deviations(self.study, runs),
-            *self.registration.other_data(self.policies, self.existing_data),
-        ]
+        return self.registration.deviations(self.study, runs, self.policies, self.existing_data)
 
     def assigned(self, cell: Cell) -> Assigned:
         """A run for a worker."""
@@ -219,6 +375,19 @@ class Plan:
     def has_begun(self) -> bool:
         """Whether it has runs, at whatever step."""
         return any((self.folder / "runs").glob("**/*.*"))
+
+    def to_register(self, policies: dict[str, str]) -> Registration:
+        """What is going to be run, as it is now, and the policies that will collect data."""
+        return Registration(
+            study=to_plain(self.study),
+            encoders=self.fingerprints,
+            policies=policies,
+            data=self.existing_data,
+            date=datetime.now(UTC).isoformat(timespec="seconds"),
+            versions=packages(),
+            commits=dict(commits()),
+            committed=self.in_git,
+        )
 
     def register(self, registration: Registration) -> None:
         """Write down what is going to be run."""

@@ -1,11 +1,12 @@
 """The data sets and encoders that a study's runs need."""
 
-import signal
-from collections import Counter
+import sys
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from types import FrameType
-from typing import Any, NamedTuple
+from typing import Any
 
 from jbrep.collect import collect
 from jbrep.collect.collector import usual_shard_episodes
@@ -24,35 +25,27 @@ from jbrep.machine import cores
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method
 from jbrep.play.sources import find_policy
-from jbrep.pool import ATTEMPTS, Pool
+from jbrep.pool import ATTEMPTS, side_by_side
 from jbrep.records.storage import exists
 from jbrep.rl import Run
-from jbrep.study.config import Data, Study, data_key
+from jbrep.study.config import Data, data_key
 from jbrep.study.plan import Plan
 from jbrep.study.representations import ByName
-from jbrep.study.work import say
 
 
 def check(plan: Plan) -> None:
     """Check, before anything is collected or trained, that the runs can start."""
+    for each in every_made(plan):
+        if each.data.folder:
+            given = Dataset(each.folder).task
+            check_same(plan.task(each.task), given, f"the data set {each.folder}")
+            each.fitter()
+        else:
+            each.to_collect()
     for name in plan.study.tasks:
         task = plan.task(name)
-        for made in made_for(plan, name):
-            if made.data.folder:
-                folder = made.data.existing(name)
-                check_same(task, Dataset(folder).task, f"the data set {folder}")
-                _check_fits(plan, made, folder)
-            else:
-                _to_collect(plan, made)
-        for each in by_name(plan):
-            largest = get_method(each.kind).largest(task.size)
-            if plan.study.data is None:
-                _check_shipped(each, task)
-            elif largest is not None and each.training.get("latent", 0) > largest:
-                raise InputError(
-                    f"{each.name} has more numbers than the {task.size} features of {name} allow: "
-                    f"choose a latent size of at most {largest}"
-                )
+        for representation in by_name(plan):
+            _check_by_name(plan, representation, task)
     _check_own(plan)
     of_each = {(cell.task, repr(cell.learner)): cell for cell in plan.cells}
     for cell in of_each.values():  # the representation decides no setting of a learner
@@ -63,6 +56,24 @@ def check(plan: Plan) -> None:
 def by_name(plan: Plan) -> list[ByName]:
     """The representations that the study makes, or that ship."""
     return [each for each in plan.study.observed if isinstance(each, ByName)]
+
+
+def _check_by_name(plan: Plan, representation: ByName, task: Task) -> None:
+    """Check that an encoder ships for a task, or can be made for it."""
+    largest = get_method(representation.kind).largest(task.size)
+    if plan.study.data is not None:
+        if largest is not None and representation.training.get("latent", 0) > largest:
+            raise InputError(
+                f"{representation.name} has more numbers than the {task.size} features of "
+                f"{task.name} allow: choose a latent size of at most {largest}"
+            )
+    elif representation.name in UNLEARNED:
+        find(representation.name, task)  # may refuse the task
+    elif representation.name not in (shipped := names(task) or (FULL,)):
+        raise InputError(
+            f"no encoder {representation.name!r} ships for {task.name}: choose one of "
+            f"{', '.join(shipped)}, or let the study train it, on the states that [data] gives"
+        )
 
 
 def _check_own(plan: Plan) -> None:
@@ -90,39 +101,162 @@ def _check_encoder(run: Run) -> None:
         )
 
 
-def _check_shipped(representation: ByName, task: Task) -> None:
-    if representation.name in UNLEARNED:
-        find(representation.name, task)  # may refuse the task
-        return
-    shipped = names(task) or (FULL,)
-    if representation.name not in shipped:
-        raise InputError(
-            f"no encoder {representation.name!r} ships for {task.name}: choose one of "
-            f"{', '.join(shipped)}, or let the study train it, on the states that [data] gives"
-        )
+@dataclass(frozen=True)
+class Made:
+    """A data set that a study needs for a task, and the encoders that are made from it.
 
+    Attributes:
+        plan: the study.
+        task: its name.
+        name: of the data; empty for those of the only table.
+        number: of several data sets.
+    """
 
-class Made(NamedTuple):
-    """A data set that the study needs for a task, and what it is made from."""
-
+    plan: Plan = field(compare=False)
     task: str
-    name: str  # of the data; empty for those of the only table
-    data: Data
-    number: int  # of several data sets
+    name: str
+    number: int
 
     def __str__(self) -> str:
-        several = f", set {self.number}" if self.data.sets != 1 else ""
+        several = f", set {self.number}" if self.plan.study.sets(self.name) > 1 else ""
         return f"{data_key(self.name)} of {self.task}{several}"
 
+    @property
+    def data(self) -> Data:
+        """What the study says of it."""
+        return self.plan.study.named_data[self.name]
 
-def made_for(plan: Plan, task: str) -> list[Made]:
-    """All data sets of a task."""
-    sets = {name: plan.study.sets(name) for name in plan.study.named_data}
+    @property
+    def folder(self) -> Path:
+        """Where it is."""
+        if self.data.folder:
+            return self.data.existing(self.task)
+        return self.plan.data(self.task, self.number, self.name)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it exists, or is collected to its end."""
+        if self.data.folder:
+            return True
+        if not exists(self.folder / MANIFEST):
+            return False
+        manifest = read_manifest(self.folder)
+        return manifest.complete and manifest.settings.steps == self.data.steps
+
+    @property
+    def is_made(self) -> bool:
+        """Whether it is complete, and its encoders are trained to the end."""
+        if not self.is_complete:
+            return False
+        fitter = self.fitter()
+        return all(
+            fitter.plan(kind, name=name, **settings).is_complete()
+            for name, kind, settings in self.fits()
+        )
+
+    def fits(self) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+        """Names, kinds and settings of the encoders that are made from it."""
+        study = self.plan.study
+        for each in by_name(self.plan):
+            if study.data_of(each) == self.name:
+                for name, settings in each.fits[self.number :: study.sets(self.name)]:
+                    yield name, each.kind, settings
+
+    def fitter(self) -> Fitter:
+        """What makes its encoders, which are checked."""
+        fitter = Fitter(self.folder, self.plan.encoders(self.task))
+        for name, kind, settings in self.fits():
+            try:
+                fitter.plan(kind, name=name, **settings)
+            except InputError as error:
+                raise InputError(f"{name} can't be trained for {self.task}: {error}") from None
+        return fitter
+
+    def policy(self) -> Policy:
+        """The policy that collects it; that of a run stays as the data set has it."""
+        task = self.plan.task(self.task).undisturbed
+        try:
+            policy = find_policy(self.data.policy, self.folder, task)
+            policy.begin(task, [0])  # may refuse the task
+        except InputError as error:
+            raise InputError(f"{data_key(self.name)}.policy for {self.task}: {error}") from None
+        return policy
+
+    def to_collect(self) -> tuple[DataSettings, Policy]:
+        """Its settings, with states where the task has them, and its policy."""
+        task, policy = self.plan.task(self.task).undisturbed, self.policy()
+        settings = DataSettings(
+            task=task,
+            policy=policy.settings(),
+            steps=self.data.steps,
+            seed=self.data.seed + self.number,
+            store_state=bool(task.state),
+        )
+        return settings, policy
+
+    def source(self) -> "Made | None":
+        """What it is derived from; None where it is collected or exists.
+
+        The Jitterbug's tasks share their motion, unless the policy acts on what it observes.
+        """
+        if self.task not in TASKS or self.data.folder:
+            return None
+        if acts_on_observations(self.policy().settings()):
+            return None
+        first = next(name for name in self.plan.study.tasks if name in TASKS)
+        sources = (replace(self, task=name) for name in TASKS)
+        collected = next((each for each in sources if each.has_states), replace(self, task=first))
+        return None if collected == self else collected
+
+    @property
+    def has_states(self) -> bool:
+        """Whether it is there, at least in part, with the states of the simulation."""
+        manifest = self.folder / MANIFEST
+        return exists(manifest) and read_manifest(self.folder).settings.store_state
+
+    def make(self, source: "Made | None", threads: int | None) -> None:
+        """Collect or derive it on some threads, and train its encoders; None takes every core."""
+        if not self.is_complete:
+            if source:
+                derive(source.folder, self.task, self.folder, num_threads=threads)
+            else:
+                settings, policy = self.to_collect()
+                episodes = usual_shard_episodes(settings, self.folder, policy)
+                settings = settings.replace(shard_episodes=episodes)
+                collect(settings, self.folder, num_threads=threads, policy=policy)
+            say(f"{self}: {read_manifest(self.folder).rows:,} states")
+        fitter = self.fitter()
+        for name, kind, given in self.fits():
+            if fitter.fit(kind, name=name, **given).is_new:
+                say(f"{self}: encoder {name}")
+
+
+def every_made(plan: Plan) -> list[Made]:
+    """All data sets of a study."""
     return [
-        Made(task, name, data.replace(sets=sets[name]), number)
-        for name, data in plan.study.named_data.items()
-        for number in range(sets[name])
+        Made(plan, task, name, number)
+        for task in plan.study.tasks
+        for name in plan.study.named_data
+        for number in range(plan.study.sets(name))
     ]
+
+
+def policies(plan: Plan) -> dict[str, str]:
+    """SHA-256 of the files of policies that are going to collect data, as `Plan.policies`."""
+    return {
+        f"{each.folder.relative_to(plan.folder)}/{part['file']}": part["sha256"]
+        for each in every_made(plan)
+        if not each.data.folder
+        for part in parts_of(each.policy().settings())
+        if part["kind"] == TRAINED
+    }
+
+
+def say(line: str) -> None:
+    """Print a line on standard error, above a live table; a study goes on where that fails."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(line, file=sys.stderr, flush=True)
 
 
 def prepare(plan: Plan, workers: int = 1) -> None:
@@ -134,193 +268,44 @@ def prepare(plan: Plan, workers: int = 1) -> None:
         plan: the study.
         workers: how many processes go on at a time.
     """
-    every = [each for task in plan.study.tasks for each in made_for(plan, task)]
-    sources = {each: source_of(plan, each) for each in every}
-    waiting = [each for each in every if not _is_made(plan, each)]
+    sources = {each: each.source() for each in every_made(plan)}
+    waiting = [each for each in sources if not each.is_made]
     waiting.sort(key=lambda each: sources[each] is not None)  # what others are derived from first
     workers = min(workers, cores(), len(waiting))
-    threads = max(1, cores() // workers) if workers else 1
     if workers < 2:
         for each in waiting:
-            _make(plan, each, sources[each], None)
+            each.make(sources[each], None)
         return
-    under_way, deaths = set[Made](), Counter[Made]()
-    with Pool[Made, str](_work, workers, lambda: None) as pool:
-        while waiting or under_way:
-            missing = under_way.union(waiting)
-            ready = [each for each in waiting if sources[each] not in missing]
-            if ready and not pool.is_full:
-                each = ready[0]
+    under_way = set[Made]()
+
+    def next_job() -> tuple[Made, Made | None] | None:
+        missing = under_way.union(waiting)
+        for each in waiting:
+            if sources[each] not in missing:
                 waiting.remove(each)
                 under_way.add(each)
-                given = plan.study, plan.folder, each, sources[each], threads
-                pool.submit(each, *given, imported_modules())
-                continue
-            each, mistake = pool.result()
+                return each, sources[each]
+        return None
+
+    make = partial(_make, max(1, cores() // workers), imported_modules())
+    with closing(side_by_side(make, next_job, workers)) as made:
+        for (each, _), mistake in made:
             under_way.remove(each)
             if mistake:
                 raise InputError(mistake)
             if mistake is None:
-                deaths[each] += 1
-                waiting.insert(0, each)
-                if deaths[each] == ATTEMPTS:
-                    raise InputError(
-                        f"the worker that makes {each} was killed {ATTEMPTS} times, perhaps "
-                        "because memory ran out: try fewer --workers"
-                    )
+                raise InputError(
+                    f"the worker that makes {each} was killed {ATTEMPTS} times, perhaps because "
+                    "memory ran out: try fewer --workers"
+                )
 
 
-def _work(
-    study: Study,
-    folder: Path,
-    made: Made,
-    source: Made | None,
-    threads: int,
-    modules: Iterable[str],
-) -> str:
-    """As `_make`, in a worker, which a request to stop interrupts; what a user did wrong."""
-    asked = signal.getsignal(signal.SIGTERM)
-    assert callable(asked)
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        asked(number, frame)
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, stop)
+def _make(threads: int, modules: Iterable[str], job: tuple[Made, Made | None]) -> str:
+    """Make a data set and its encoders, in a worker; what a user did wrong."""
+    made, source = job
     try:
         import_modules(modules)
-        _make(Plan(study, folder), made, source, threads)
+        made.make(source, threads)
         return ""
     except InputError as error:
         return str(error)
-    except KeyboardInterrupt:
-        return "it was stopped"  # which no one hears
-    finally:
-        signal.signal(signal.SIGTERM, asked)
-
-
-def _make(plan: Plan, made: Made, source: Made | None, threads: int | None) -> None:
-    """Collect or derive a data set, and train the encoders that are made from it."""
-    folder = folder_of(plan, made)
-    if not made.data.folder and not is_complete(folder, made):
-        if source:
-            derive(folder_of(plan, source), made.task, folder, num_threads=threads)
-        else:
-            collect_made(plan, made, threads)
-        say(f"{made}: {read_manifest(folder).rows:,} states")
-    fitter = _check_fits(plan, made, folder)
-    for name, kind, settings in fits(plan, made):
-        if fitter.fit(kind, name=name, **settings).is_new:
-            say(f"{made}: encoder {name}")
-
-
-def _is_made(plan: Plan, made: Made) -> bool:
-    """Whether a data set is complete, and its encoders are trained to the end."""
-    folder = folder_of(plan, made)
-    if not (made.data.folder or is_complete(folder, made)):
-        return False
-    fitter = _check_fits(plan, made, folder)
-    return all(
-        fitter.plan(kind, name=name, **settings).is_complete()
-        for name, kind, settings in fits(plan, made)
-    )
-
-
-def is_complete(folder: Path, made: Made) -> bool:
-    """Whether a data set that is collected is there to its end."""
-    if not exists(folder / MANIFEST):
-        return False
-    manifest = read_manifest(folder)
-    return manifest.complete and manifest.settings.steps == made.data.steps
-
-
-def folder_of(plan: Plan, made: Made) -> Path:
-    """Where a data set is."""
-    if made.data.folder:
-        return made.data.existing(made.task)
-    return plan.data(made.task, made.number, made.name)
-
-
-def _check_fits(plan: Plan, made: Made, folder: Path) -> Fitter:
-    """Check that the encoders of a task can be made from a data set; what makes them."""
-    fitter = Fitter(folder, plan.encoders(made.task))
-    for name, kind, settings in fits(plan, made):
-        try:
-            fitter.plan(kind, name=name, **settings)
-        except InputError as error:
-            raise InputError(f"{name} can't be trained for {made.task}: {error}") from None
-    return fitter
-
-
-def policies(plan: Plan) -> dict[str, str]:
-    """SHA-256 of the files of policies that act in data that are collected, as `Plan.policies`."""
-    return {
-        f"{folder_of(plan, made).relative_to(plan.folder)}/{part['file']}": part["sha256"]
-        for task in plan.study.tasks
-        for made in made_for(plan, task)
-        if not made.data.folder
-        for part in parts_of(_policy(plan, made).settings())
-        if part["kind"] == TRAINED
-    }
-
-
-def fits(plan: Plan, made: Made) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Names, kinds and settings of the encoders that are made from a data set."""
-    for representation in by_name(plan):
-        if plan.study.data_of(representation) == made.name:
-            for name, settings in representation.fits[made.number :: plan.study.sets(made.name)]:
-                yield name, representation.kind, settings
-
-
-def source_of(plan: Plan, made: Made) -> Made | None:
-    """What a data set is derived from; None where it is collected or exists.
-
-    The Jitterbug's tasks share their motion, unless the policy acts on what it observes.
-    """
-    if made.task not in TASKS or made.data.folder:
-        return None
-    if acts_on_observations(_policy(plan, made).settings()):
-        return None
-    collected = _collected(plan, made)
-    return None if collected == made.task else made._replace(task=collected)
-
-
-def collect_made(plan: Plan, made: Made, threads: int | None) -> None:
-    """Collect a data set on some threads; None takes one for each core."""
-    folder, (settings, policy) = folder_of(plan, made), _to_collect(plan, made)
-    episodes = usual_shard_episodes(settings, folder, policy)
-    settings = settings.replace(shard_episodes=episodes)
-    collect(settings, folder, num_threads=threads, policy=policy)
-
-
-def _to_collect(plan: Plan, made: Made) -> tuple[DataSettings, Policy]:
-    """The settings of a data set, with states where the task has them, and its policy."""
-    task, policy = plan.task(made.task).undisturbed, _policy(plan, made)
-    settings = DataSettings(
-        task=task,
-        policy=policy.settings(),
-        steps=made.data.steps,
-        seed=made.data.seed + made.number,
-        store_state=bool(task.state),
-    )
-    return settings, policy
-
-
-def _policy(plan: Plan, made: Made) -> Policy:
-    """The policy that collects a data set; that of a run stays as the data set has it."""
-    task = plan.task(made.task).undisturbed
-    try:
-        policy = find_policy(made.data.policy, folder_of(plan, made), task)
-        policy.begin(task, [0])  # may refuse the task
-    except InputError as error:
-        raise InputError(f"{data_key(made.name)}.policy for {made.task}: {error}") from None
-    return policy
-
-
-def _collected(plan: Plan, made: Made) -> str:
-    """The Jitterbug's task whose data are collected: those there with states, or the first's."""
-    folders = {name: plan.data(name, made.number, made.name) for name in TASKS}
-    there = [name for name, folder in folders.items() if exists(folder / MANIFEST)]
-    with_states = (name for name in there if read_manifest(folders[name]).settings.store_state)
-    first = next(name for name in plan.study.tasks if name in TASKS)
-    return next(with_states, first)

@@ -1,16 +1,13 @@
 """What was run, in one file: every run, the settings under each label, the unfinished runs."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
-from jbrep.coordinates import OBSERVATION
-from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import FULL, load
 from jbrep.encoders.base import OWN
 from jbrep.envs.task import Task
@@ -24,16 +21,13 @@ from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan, read_plan
-from jbrep.study.work import read_progress
 
 RECORD = "runs.json"
 EACH_ITS_OWN = "runs have different encoders"
-_Value = TypeVar("_Value")
 
 Count = Annotated[int, Meta(ge=0, le=MOST_WHOLE)]
 Size = Annotated[int, Meta(ge=1, le=MOST_WHOLE)]
-Layer = tuple[Size, str]  # units and activation
-Layers = Annotated[tuple[Layer, ...], Meta(max_length=100)]
+Layers = Annotated[tuple[tuple[Size, str], ...], Meta(max_length=100)]  # units and activations
 
 
 class LabelSettings(SharedSettings, frozen=True, kw_only=True):
@@ -44,16 +38,14 @@ class LabelSettings(SharedSettings, frozen=True, kw_only=True):
     ]
     begin_from: str | None = msgspec.field(name="from")
 
-
-class ShownFacts(Record, frozen=True, kw_only=True, forbid_unknown_fields=False):
-    """What reports show of how an encoder was made; other facts stand beside."""
-
-    noise: float | None = None  # standard deviation of the corruption in training
-    scaling: str = EXTREMA  # of the features
-    on: str = OBSERVATION  # what is encoded: the observation, or coordinates of it
-    keep: tuple[str, ...] = ()  # features that pass around the encoder
-    train_rows: Count | None = None
-    held_out_mse: float | None = None
+    @classmethod
+    def of(cls, run: RunSettings) -> "LabelSettings":
+        """Those of a run."""
+        return cls(
+            **{name: getattr(run, name) for name in SharedSettings.__struct_fields__},
+            encoder=run.encoder if run.encoder_seed is None else EACH_ITS_OWN,
+            begin_from=None if run.begin_from is None else "another run's policy",
+        )
 
 
 class EncoderFacts(Record, frozen=True, kw_only=True):
@@ -69,14 +61,23 @@ class EncoderFacts(Record, frozen=True, kw_only=True):
     data: Mapping[str, Any] = {}  # that it was trained on
     metrics: Mapping[str, Any] = {}  # of the training
 
-    def check(self) -> None:
-        """As for `Record`: check what reports show."""
-        _ = self.shown
-
-    @cached_property
-    def shown(self) -> ShownFacts:
-        """What reports show of its training, data and metrics."""
-        return from_plain({**self.training, **self.data, **self.metrics}, ShownFacts)
+    @classmethod
+    def of(cls, folder: Path, run: RunRecord) -> "EncoderFacts":
+        """Those of a run's encoder; of code, its sizes alone."""
+        if not exists(folder / ENCODER):
+            return cls(
+                name=run.settings.encoder_code or "an object in Python",
+                kind=OWN,
+                size=run.settings.environment.size,
+                latent_size=run.latent_size,
+            )
+        encoder = load(folder / ENCODER)
+        return cls(
+            **{name: getattr(encoder, name) for name in ("name", "kind", "size", "latent_size")},
+            encoder=tuple((layer.units, layer.activation) for layer in encoder.encoder),
+            decoder=tuple((layer.units, layer.activation) for layer in encoder.decoder),
+            **{name: getattr(encoder.header, name) for name in ("training", "data", "metrics")},
+        )
 
 
 class Label(Record, frozen=True, kw_only=True):
@@ -84,6 +85,22 @@ class Label(Record, frozen=True, kw_only=True):
 
     settings: LabelSettings
     encoder: EncoderFacts
+
+    @classmethod
+    def of(cls, runs: Mapping[Path, RunRecord]) -> "Label":
+        """That of runs by folder; the settings are those of the first."""
+        settings = LabelSettings.of(next(iter(runs.values())).settings)
+        folders = list(runs) if settings.encoder == EACH_ITS_OWN else list(runs)[:1]
+        first, *others = (to_plain(EncoderFacts.of(each, runs[each])) for each in folders)
+        common = {name: _common(first[name], [each[name] for each in others]) for name in first}
+        return cls(settings=settings, encoder=EncoderFacts(**common))
+
+
+def _common(value: Any, others: Sequence[Any]) -> Any:
+    """A value if the others are equal; of a dict the items that they have, too; else nothing."""
+    if isinstance(value, dict):
+        return {n: v for n, v in value.items() if all(n in o and o[n] == v for o in others)}
+    return value if all(each == value for each in others) else type(value)()
 
 
 class RunFacts(Record, frozen=True, kw_only=True):
@@ -99,6 +116,17 @@ class RunFacts(Record, frozen=True, kw_only=True):
     seconds: Annotated[float, Meta(ge=0)]
     differs: dict[str, Any] = msgspec.field(default_factory=dict)  # settings other than its label's
 
+    @classmethod
+    def of(cls, run: RunRecord, shared: LabelSettings) -> "RunFacts":
+        """What is told of a run besides the settings of its label."""
+        own, usual = to_plain(LabelSettings.of(run.settings)), to_plain(shared)
+        return cls(
+            label=run.settings.label,
+            **{n: getattr(run.settings, n) for n in ("seed", "encoder", "encoder_seed")},
+            **{n: getattr(run, n) for n in ("status", "reason", "steps", "seconds")},
+            differs={name: value for name, value in own.items() if value != usual[name]},
+        )
+
 
 class RegistrationFacts(Record, frozen=True, kw_only=True):
     """Of a study that was registered."""
@@ -110,7 +138,7 @@ class RegistrationFacts(Record, frozen=True, kw_only=True):
 
 
 class RunsRecord(Document, frozen=True, kw_only=True):
-    """runs.json."""
+    """runs.json: the runs that have ended, the settings under each label, the unfinished runs."""
 
     format = "jbrep runs"
     format_version = 5
@@ -167,128 +195,50 @@ class RunsRecord(Document, frozen=True, kw_only=True):
             return shared
         return from_plain({**to_plain(shared), **run.differs}, LabelSettings)
 
+    def with_table(self, name: str, sha256: str) -> "RunsRecord":
+        """The same beside another table."""
+        return self.replace(tables={**self.tables, name: sha256})
 
-def runs_record(
-    folder: Path, ended: Mapping[Path, RunRecord], tables: Mapping[str, str]
-) -> RunsRecord:
-    """What was run.
+    @classmethod
+    def of(cls, folder: Path, ended: Mapping[Path, RunRecord]) -> "RunsRecord":
+        """What was run, as yet without tables.
 
-    Args:
-        folder: of a study, or any folder with runs below it.
-        ended: what run.json says of each run that has finished or failed, by folder.
-        tables: SHA-256 of the tables of these runs, by their files' names.
-    """
-    order = in_order((run.settings.representation for run in ended.values()), FULL)
-    by_label: dict[str, dict[Path, RunRecord]] = {}
-    for each, run in sorted(ended.items(), key=lambda item: _sort_key(item[1].settings, order)):
-        by_label.setdefault(run.settings.label, {})[each] = run
-    runs = [run for of_label in by_label.values() for run in of_label.values()]
-    labels = {label: _label(of_label) for label, of_label in by_label.items()}
-    plan = read_plan(folder)
-    unfinished = {each.name: plan.folder_of(each) for each in plan.unfinished} if plan else {}
-    return RunsRecord(
-        study=plan.study if plan else None,
-        registration=_registration(plan, runs) if plan else None,
-        missing={name: read_progress(each)[0] for name, each in unfinished.items()},
-        tables=dict(tables),
-        versions=_distinct(dict(run.versions) for run in runs),
-        processors=_distinct(run.cpu for run in runs),
-        labels=labels,
-        runs=[_run(run, labels[run.settings.label].settings) for run in runs],
-    )
+        Args:
+            folder: of a study, or any folder with runs below it.
+            ended: the runs that have finished or failed, by folder.
+        """
+        order = in_order((run.settings.representation for run in ended.values()), FULL)
 
+        def place(run: RunRecord) -> tuple[Any, ...]:
+            own = run.settings
+            return own.task, own.learner, order.index(own.representation), own.seed
 
-def _run(run: RunRecord, of_label: LabelSettings) -> RunFacts:
-    """What is told of a run besides the settings of its label."""
-    settings, shared = map(to_plain, (_shared_settings(run.settings), of_label))
-    return RunFacts(
-        label=run.settings.label,
-        seed=run.settings.seed,
-        encoder=run.settings.encoder,
-        encoder_seed=run.settings.encoder_seed,
-        status=run.status,
-        reason=run.reason,
-        steps=run.steps,
-        seconds=run.seconds,
-        differs={name: value for name, value in settings.items() if value != shared[name]},
-    )
-
-
-def _sort_key(settings: RunSettings, order: list[str]) -> tuple[Any, ...]:
-    """By task, algorithm, representation (in the order of tables) and seed."""
-    representation = order.index(settings.representation)
-    return settings.task, settings.learner, representation, settings.seed
-
-
-def _shared_settings(settings: RunSettings) -> LabelSettings:
-    """The settings that all runs of a label share: without the seed and what depends on it."""
-    shared = {name: getattr(settings, name) for name in SharedSettings.__struct_fields__}
-    return LabelSettings(
-        **shared,
-        encoder=settings.encoder if settings.encoder_seed is None else EACH_ITS_OWN,
-        begin_from=None if settings.begin_from is None else "another run's policy",
-    )
-
-
-def _label(runs: Mapping[Path, RunRecord]) -> Label:
-    """What the runs of a label share, by folder; its settings are those of the first."""
-    settings = _shared_settings(next(iter(runs.values())).settings)
-    folders = list(runs) if settings.encoder == EACH_ITS_OWN else list(runs)[:1]
-    encoder = _common([_encoder(each, runs[each]) for each in folders])
-    return Label(settings=settings, encoder=encoder)
-
-
-def _encoder(folder: Path, run: RunRecord) -> EncoderFacts:
-    """What is known of a run's encoder; of a user's own, its sizes alone."""
-    settings = run.settings
-    if not exists(folder / ENCODER):
-        return EncoderFacts(
-            name=settings.encoder_code or "an object in Python",
-            kind=OWN,
-            size=settings.environment.size,
-            latent_size=run.latent_size,
+        by_label: dict[str, dict[Path, RunRecord]] = {}
+        for each, run in sorted(ended.items(), key=lambda item: place(item[1])):
+            by_label.setdefault(run.settings.label, {})[each] = run
+        labels = {label: Label.of(runs) for label, runs in by_label.items()}
+        runs = [run for of_label in by_label.values() for run in of_label.values()]
+        plan = read_plan(folder)
+        versions = [run.versions for run in runs]
+        return cls(
+            study=plan.study if plan else None,
+            registration=_registered(plan, runs) if plan else None,
+            missing={cell.name: plan.progress(cell)[0] for cell in plan.unfinished} if plan else {},
+            tables={},
+            versions=[*{frozenset(each.items()): dict(each) for each in versions}.values()],
+            processors=[*dict.fromkeys(run.cpu for run in runs)],
+            labels=labels,
+            runs=[RunFacts.of(run, labels[run.settings.label].settings) for run in runs],
         )
-    encoder = load(folder / ENCODER)
-    return EncoderFacts(
-        name=encoder.name,
-        kind=encoder.kind,
-        size=encoder.size,
-        latent_size=encoder.latent_size,
-        encoder=tuple((layer.units, layer.activation) for layer in encoder.encoder),
-        decoder=tuple((layer.units, layer.activation) for layer in encoder.decoder),
-        **{name: getattr(encoder.header, name) for name in ("training", "data", "metrics")},
-    )
 
 
-def _common(encoders: Sequence[EncoderFacts]) -> EncoderFacts:
-    """What is the same of all encoders; empty where nothing is."""
-    first, *others = map(to_plain, encoders)
-    return EncoderFacts(**{n: _shared(v, [o[n] for o in others]) for n, v in first.items()})
-
-
-def _shared(value: Any, others: Sequence[Any]) -> Any:
-    """A value if the others are equal; of a dict the items that they have, too; else nothing."""
-    if isinstance(value, dict):
-        return {n: v for n, v in value.items() if all(n in o and o[n] == v for o in others)}
-    return value if all(each == value for each in others) else type(value)()
-
-
-def _registration(plan: Plan, runs: Collection[RunRecord]) -> RegistrationFacts | None:
+def _registered(plan: Plan, runs: Collection[RunRecord]) -> RegistrationFacts | None:
     """When a study was registered, and how what ran differs from that; None if it wasn't."""
     if (found := plan.registration) is None:
         return None
-    deviations = plan.deviations(runs)
     return RegistrationFacts(
         sha256=found.sha256,
         date=found.date,
-        deviations=deviations,
+        deviations=plan.deviations(runs),
         seeds=found.registered.seeds,
     )
-
-
-def _distinct(values: Iterable[_Value]) -> list[_Value]:
-    distinct: list[_Value] = []
-    for value in values:
-        if value not in distinct:
-            distinct.append(value)
-    return distinct

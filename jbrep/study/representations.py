@@ -124,7 +124,6 @@ class ByFile(Representation, frozen=True, kw_only=True):
     file: _Path | dict[str, _Path]
 
     def check(self) -> None:
-        """As for `Record`: check the words in braces."""
         for path in self._paths:
             words = set(re.findall(r"\{.*?\}", path))
             if _ENCODER in words and not self.encoders:

@@ -2,39 +2,103 @@
 
 import sys
 import time
-from collections import Counter, deque
+import traceback
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager, closing, nullcontext
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from jbrep.envs.names import imported_modules
+from jbrep.envs.names import import_modules, imported_modules
+from jbrep.errors import first_line
 from jbrep.machine import cores
-from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
+from jbrep.pool import ATTEMPTS, on_cluster, side_by_side, stop_requested
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder
-from jbrep.rl.files import FAILED, FINISHED, read_run
+from jbrep.records.storage import exists, make_folder, write_note
+from jbrep.rl import Session, StoppedError, train
+from jbrep.rl.files import FAILED, FINISHED, read_run, runs_below
+from jbrep.rl.history import History
 from jbrep.rl.settings import CPU, CUDA
 from jbrep.rl.training import drop_checkpoint, standing_of
-from jbrep.study.plan import STUDY, Cell, Plan
-from jbrep.study.prepare import check, policies, prepare
-from jbrep.study.registration import (
+from jbrep.study.plan import (
+    PROGRESS,
     REGISTRATION,
-    Registration,
+    STUDY,
+    Assigned,
+    Cell,
+    Plan,
     beside,
     find_committed,
     registration_in,
 )
-from jbrep.study.results import play_references
-from jbrep.study.tables import REFERENCE_RETURNS
-from jbrep.study.work import CRASHED, Outcome, read_progress, say, work
-from jbrep.text import duration
+from jbrep.study.prepare import check, policies, prepare, say
+from jbrep.study.tables import REFERENCE_RETURNS, play_references, write_tables
+from jbrep.text import duration, rounded
 
+ERROR = "error.txt"  # the traceback of a run that crashed
+CRASHED = "crashed"
 _OWN = STUDY, REGISTRATION, REFERENCE_RETURNS, "data", "encoders", "runs"  # see `make_folder`
+_PATIENCE = 60.0  # seconds, until runs have written their checkpoints
+_WRITE_EVERY = 1.0  # seconds
+
+
+class Outcome(NamedTuple):
+    """How a run ended."""
+
+    name: str
+    status: str  # finished, failed or crashed
+    message: str  # the reason, or how long it took
+
+
+def work(assigned: Assigned, modules: Iterable[str] = ()) -> Outcome | None:
+    """Train a run; an error is reported in its outcome and stops no other run.
+
+    Args:
+        assigned: the run.
+        modules: to import first, as they register environments.
+
+    Returns:
+        How the run ended; None if it was stopped.
+    """
+    try:
+        make_folder(assigned.folder)
+        import_modules(modules)
+        watch = _ProgressFile(assigned.folder, assigned.run.steps)
+        result = train(assigned.run, assigned.folder, Session(watch, stop=stop_requested))
+    except StoppedError:
+        return None
+    except Exception as error:
+        return _crashed(assigned, error)
+    for leftover in (PROGRESS, ERROR):
+        (assigned.folder / leftover).unlink(missing_ok=True)
+    message = result.reason or f"{result.seconds / 60:.1f} min"
+    return Outcome(assigned.name, result.status, message)
+
+
+def _crashed(assigned: Assigned, error: Exception) -> Outcome:
+    path = assigned.folder / ERROR
+    write_note(path, "".join(traceback.format_exception(error)))
+    return Outcome(assigned.name, CRASHED, f"{first_line(error)}; see {path}")
+
+
+class _ProgressFile:
+    """Tells the parent process, through a file, how far a run is."""
+
+    def __init__(self, folder: Path, steps: int) -> None:
+        self._path, self._steps, self._written = folder / PROGRESS, steps, 0.0
+
+    def __call__(self, history: History, step: int) -> None:
+        now = time.monotonic()
+        if step >= self._steps or now - self._written >= _WRITE_EVERY:
+            shown = rounded(history.means[-1])[0] if history.evaluations else "-"
+            write_note(self._path, f"{step} {shown}")
+            self._written = now
+
 
 Backend = Callable[[Plan, Iterable[Cell], int], Generator[Outcome]]
 
@@ -50,21 +114,14 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
     A run whose worker is killed is resumed from its checkpoint by another, up to five times. Closed
     early, this waits until the runs under way have written their checkpoints.
     """
-    waiting, deaths = deque(cells), Counter[str]()
-    with Pool[Cell, Outcome | None](work, workers, _announce_stop) as pool:
-        while waiting or not pool.is_idle:
-            while waiting and not pool.is_full:
-                cell = waiting.popleft()
-                pool.submit(cell, *_job(plan, cell))
-            cell, outcome = pool.result()
-            if outcome is not None:
-                yield outcome
-                continue
-            deaths[cell.name] += 1
-            if deaths[cell.name] == ATTEMPTS:
-                yield _killed(cell.name)
-            else:
-                waiting.append(cell)
+    jobs = map(plan.assigned, cells)
+    train = partial(work, modules=imported_modules())
+    ended = side_by_side(
+        train, lambda: next(jobs, None), workers, _PATIENCE, stopping=_announce_stop
+    )
+    with closing(ended):
+        for job, outcome in ended:
+            yield outcome or _killed(job.name)
 
 
 def _announce_stop() -> None:
@@ -86,7 +143,8 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome
     import ray
 
     task = on_cluster(work, workers, gpus=int(plan.device == CUDA))
-    under_way = {task.remote(*_job(plan, cell)): cell for cell in cells}
+    known = imported_modules()
+    under_way = {task.remote(plan.assigned(cell), known): cell for cell in cells}
     try:
         while under_way:
             (done,), _ = ray.wait(list(under_way))
@@ -106,11 +164,6 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome
 BACKENDS: dict[str, Backend] = {"local": on_this_machine, "ray": on_ray}
 
 
-def _job(plan: Plan, cell: Cell) -> tuple[Any, ...]:
-    """The arguments of `work`."""
-    return plan.assigned(cell), stop_requested, imported_modules()
-
-
 def run_study(
     plan: Plan,
     backend: Backend = on_this_machine,
@@ -119,9 +172,7 @@ def run_study(
     """Collect data, train encoders, and train every agent that hasn't been trained yet.
 
     A study with claims is registered first: beside its file, in a commit, where git has that file.
-
-    At last the policies play that agents are compared with. `jbrep.study.results.write_tables` then
-    writes what came of it.
+    At last the policies play that agents are compared with.
 
     Args:
         plan: the study.
@@ -140,7 +191,7 @@ def run_study(
         if registered:
             plan.register(registered)
         elif plan.study.has_claims and not plan.has_begun:
-            _register(plan)
+            plan.register(plan.to_register(policies(plan)))
         prepare(plan, workers)
         for cell in plan.cells:  # so that any mistake shows before the first run
             if standing_of(plan.run(cell), plan.folder_of(cell)).ended:
@@ -151,17 +202,16 @@ def run_study(
             with progress.live, closing(backend(plan, unfinished, workers)) as outcomes:
                 for outcome in outcomes:
                     progress.report(outcome)
-        play_references(plan)
+        if runs_below(plan.folder):
+            write_tables(plan.folder)
+            play_references(plan.folder)
     return progress.counts[CRASHED]
 
 
 def register_study(plan: Plan) -> Path:
     """Write down what is going to be run: beside the study's file, or in its folder without one.
 
-    What is registered already stays as it is.
-
-    Returns:
-        The registration's file.
+    What is registered already stays as it is. Returns the registration's file.
     """
     check(plan)
     if plan.file is None:
@@ -170,27 +220,13 @@ def register_study(plan: Plan) -> Path:
             plan.begin()
             plan.write()
             if plan.registration is None:
-                _register(plan)
+                plan.register(plan.to_register(policies(plan)))
         return plan.folder / REGISTRATION
     path = beside(plan.file)
     if not exists(path) or registration_in(path).registered != plan.study:
         plan.check_new()
-        _registration(plan).write(path)
+        plan.to_register(policies(plan)).write(path)
     return path
-
-
-def _register(plan: Plan) -> None:
-    plan.register(_registration(plan))
-
-
-def _registration(plan: Plan) -> Registration:
-    return Registration.of(
-        plan.study,
-        encoders=plan.fingerprints,
-        policies=policies(plan),
-        data=plan.existing_data,
-        committed=plan.in_git,
-    )
 
 
 class Progress:
@@ -206,59 +242,49 @@ class Progress:
     """
 
     def __init__(self, plan: Plan, unfinished: Iterable[Cell]):
-        self._plan = plan
-        self._unfinished = {cell.name: cell for cell in unfinished}
-        self.counts = Counter[str](
-            read_run(plan.folder_of(cell)).status
-            for cell in plan.cells
-            if cell.name not in self._unfinished
-        )
-        self._start, self._ended = time.monotonic(), 0  # runs that ended since then
-        self._steps_before = self._steps_under_way()
+        self._plan, self._unfinished = plan, {cell.name: cell for cell in unfinished}
+        ended = [cell for cell in plan.cells if cell.name not in self._unfinished]
+        self.counts = Counter[str](read_run(plan.folder_of(cell)).status for cell in ended)
+        self._start, self._steps_before = time.monotonic(), self._steps()
         self.live: AbstractContextManager[object] = nullcontext()
         if sys.stderr is not None and sys.stderr.isatty():
+            console = Console(stderr=True)
             self.live = Live(
-                console=Console(stderr=True),
-                get_renderable=self._table,
-                refresh_per_second=1,
-                transient=True,
+                console=console, get_renderable=self._table, refresh_per_second=1, transient=True
             )
 
     def report(self, outcome: Outcome) -> None:
         """Count a run that has ended, and print a line."""
         del self._unfinished[outcome.name]
         self.counts[outcome.status] += 1
-        self._ended += 1
         total = len(self._plan.cells)
         number = total - len(self._unfinished)
         say(f"{number}/{total} {outcome.name} {outcome.status}: {outcome.message}")
 
     def _table(self) -> Table:
-        table = Table(box=None, pad_edge=False)
-        for name in ("running", "steps", "last evaluation"):
-            table.add_column(name, justify="left" if name == "running" else "right")
+        table = Table("running", box=None, pad_edge=False)
+        for name in ("steps", "last evaluation"):
+            table.add_column(name, justify="right")
+        steps = self._plan.study.steps
         for cell in list(self._unfinished.values()):
-            step, mean = read_progress(self._plan.folder_of(cell))
-            last = mean if step < self._plan.study.steps else "final ones under way"
+            step, mean = self._plan.progress(cell)
+            last = mean if step < steps else "final ones under way"
             if step:
-                table.add_row(cell.name, f"{step:,} of {self._plan.study.steps:,}", last)
+                table.add_row(cell.name, f"{step:,} of {steps:,}", last)
         table.caption = self._summary()
         return table
 
     def _summary(self) -> str:
         counts = [f"{self.counts[status]} {status}" for status in (FINISHED, FAILED, CRASHED)]
-        return ", ".join([*counts, f"{len(self._unfinished)} to go, {self._time_left()} left"])
+        to_go = len(self._plan.cells) * self._plan.study.steps - (steps := self._steps())
+        left, done = "-", steps - self._steps_before
+        if done > 0:
+            left = duration((time.monotonic() - self._start) / done * to_go)
+        return ", ".join([*counts, f"{len(self._unfinished)} to go, {left} left"])
 
-    def _steps_under_way(self) -> int:
-        """Steps that the unfinished runs have done."""
-        cells = list(self._unfinished.values())
-        return sum(read_progress(self._plan.folder_of(cell))[0] for cell in cells)
-
-    def _time_left(self) -> str:
-        """From the steps done since the start."""
-        steps, under_way = self._plan.study.steps, self._steps_under_way()
-        done = self._ended * steps + under_way - self._steps_before
-        if done <= 0:
-            return "-"
-        seconds_per_step = (time.monotonic() - self._start) / done
-        return duration(seconds_per_step * (len(self._unfinished) * steps - under_way))
+    def _steps(self) -> int:
+        """Steps that all runs have done, those that have ended all of theirs."""
+        unfinished = list(self._unfinished.values())
+        ended = len(self._plan.cells) - len(unfinished)
+        under_way = sum(self._plan.progress(cell)[0] for cell in unfinished)
+        return ended * self._plan.study.steps + under_way

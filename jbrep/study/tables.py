@@ -1,48 +1,45 @@
-"""The tables of a study: returns of its runs and of reference policies, diagnostics of encoders."""
+"""The tables of a study: its runs, their returns, what policies return.
 
+runs.json says what was run and has the SHA-256 of the others, so it is written after them.
+"""
+
+import hashlib
+import json
 import warnings
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jbrep.encoders import FULL
-from jbrep.envs.task import Array, Task
+from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, Notice
-from jbrep.evaluate.evaluation import EVALUATION, Evaluation
-from jbrep.evaluate.table import (
-    DIAGNOSTICS,
-    Diagnosed,
-    Values,
-    diagnostics_text,
-    headline,
-    read_diagnostics,
-)
-from jbrep.jitterbug.heuristics import HEURISTICS
-from jbrep.play.sources import find_player
+from jbrep.play.references import play, policies_of
 from jbrep.records.document import read_document
+from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
-from jbrep.records.tables import hash_of, read_rows, rounded, write_csv, write_text
-from jbrep.stats.scale import CONSTANT, LOOKING, RANDOM, STILL
-from jbrep.study.record import RECORD, RunsRecord
-from jbrep.text import slug
+from jbrep.records.tables import read_rows, write_csv, write_rows
+from jbrep.rl.files import (
+    ENCODER,
+    FAILED,
+    RUN,
+    RunRecord,
+    read_evaluations,
+    read_infos,
+    read_run,
+    runs_below,
+)
+from jbrep.stats import RunCurve
+from jbrep.stats.scale import best_blind
+from jbrep.study.plan import STUDY
+from jbrep.study.record import RECORD, RunFacts, RunsRecord
+from jbrep.text import counted
 
 RETURNS = "returns.csv"
 REFERENCE_RETURNS = "references.csv"
 RUN_INFOS = "run-infos.csv"  # a run may be in the same folder: its own table is infos.csv
-_POLICIES = {
-    STILL: "still",
-    CONSTANT: "constant:drive=0.75",  # of five, what moves the Jitterbug furthest
-    RANDOM: "uniform",
-    LOOKING: "heuristic",
-}
-References = dict[str, dict[str, list[float]]]  # returns by task and policy
 
-_TASK = "{task}"  # in an evaluation's path: the task's name as in folders
-_Key = tuple[str, str]  # a task, and an encoder's SHA-256 or `full`
+References = dict[str, dict[str, list[float]]]  # returns by task and policy
 
 
 class Return(NamedTuple):
@@ -93,235 +90,214 @@ def by_run(returns: Iterable[Return]) -> dict[tuple[str, int], dict[int, list[fl
     return found
 
 
-def former_record(folder: Path) -> RunsRecord | None:
-    """What runs.json in a folder says; None where that is missing or can't be read."""
-    try:
-        return read_document(folder / RECORD, RunsRecord)
-    except InputError:
-        return None
+class Tables(NamedTuple):
+    """All tables of a study."""
+
+    record: RunsRecord
+    returns: list[Return]
+    infos: list[RunInfo]
+    references: References
+
+    def curves(self) -> list[RunCurve]:
+        """The returns of each run over training, and what they are held against."""
+        evaluated = by_run(self.returns)
+        return [
+            _curve(self, run, evaluated.get((run.label, run.seed), {})) for run in self.record.runs
+        ]
 
 
-def table_hashes(folder: Path) -> Mapping[str, str]:
-    """The SHA-256 of each table by runs.json; none where that is missing or can't be read."""
-    former = former_record(folder)
-    return former.tables if former else {}
+def has_runs(folder: Path) -> bool:
+    """Whether a run below a folder has ended, or it is of a study that has no tables yet."""
+    return any(folder.rglob(RUN)) or (exists(folder / STUDY) and not exists(folder / RECORD))
 
 
-def write_references(
-    tasks: Iterable[tuple[Task, int]],
-    folder: Path,
-    before: Mapping[str, str],
-    played_on: Mapping[str, Task] = {},
-    top: str | float = "",
-) -> str | None:
-    """Play the reference policies of tasks: three that don't look, and hand-written if there is.
-
-    What the file has already isn't played again; what can't be played stays in it.
-
-    Args:
-        tasks: each with its number of episodes.
-        folder: for the file.
-        before: what runs.json says of the tables. A file that is another is written anew.
-        played_on: tasks by name as they were then; those that were others are played anew.
-        top: a further policy, which scores 1; a return isn't played.
-
-    Returns:
-        The SHA-256 of the file; None if there is nothing to write.
-
-    Raises:
-        DamageError: the file is another, and what was in it can't be played here.
-    """
-    path, damage = folder / REFERENCE_RETURNS, None
-    try:
-        there = _there(path, before)
-    except DamageError as error:
-        there, damage = [], error
-    rows = []
-    for task, episodes in sorted(tasks, key=lambda each: each[0].name):
-        for policy in _policies(task, top):
-            own = [row for row in there if (row.task, row.policy) == (task.name, policy)]
-            if played_on.get(task.name, task) != task:
-                own = []
-            if [row.episode for row in own] != [*range(episodes)]:
-                try:
-                    own = _played(task, policy, episodes)
-                except Exception as error:  # what has been trained is reported all the same
-                    told = f"policy {policy!r} couldn't be played on {task.name}: {error}"
-                    warnings.warn(told, Notice, stacklevel=2)
-            if damage and not own:
-                raise damage
-            rows += own
-    return write_csv(path, ("task", "policy", "episode", "return"), rows) if rows else None
-
-
-def references_of(task: Task, episodes: int) -> dict[str, Array]:
-    """Returns of the reference policies of a task in its first episodes, by policy.
-
-    There is none of an environment that isn't installed.
-    """
-    found: dict[str, Array] = {}
-    for policy in _policies(task):
-        with suppress(Exception):  # a run is told of all the same
-            rows = _played(task, policy, episodes)
-            found[policy] = np.array([row.episode_return for row in rows])
-    return found
-
-
-def hash_of_references(folder: Path, before: Mapping[str, str]) -> str | None:
-    """The SHA-256 of references.csv, which must be what it was before; None if there is none."""
-    path = folder / REFERENCE_RETURNS
-    if not exists(path):
-        return None
-    read_rows(path, _Reference, before.get(REFERENCE_RETURNS))
-    return hash_of(path.read_text())
-
-
-def read_references(folder: Path, sha256: str | None) -> References:
-    """What `write_references` wrote.
-
-    Args:
-        folder: that the file is in.
-        sha256: of the file; None if there was nothing to write.
-
-    Raises:
-        DamageError: it isn't what was written.
-    """
-    found: References = {}
-    for row in read_rows(folder / REFERENCE_RETURNS, _Reference, sha256) if sha256 else []:
-        found.setdefault(row.task, {}).setdefault(row.policy, []).append(row.episode_return)
-    return found
-
-
-def _policies(task: Task, top: str | float = "") -> Iterator[str]:
-    """The reference policies that a task has, and one that is named."""
-    yield from (policy for policy in _POLICIES if policy != LOOKING or task.name in HEURISTICS)
-    if isinstance(top, str) and top:
-        yield top
-
-
-def _there(path: Path, before: Mapping[str, str]) -> list[_Reference]:
-    """What the file has; nothing if there is none."""
-    if not exists(path):
-        return []
-    return read_rows(path, _Reference, before.get(REFERENCE_RETURNS, "") if before else None)
-
-
-def _played(task: Task, policy: str, episodes: int) -> list[_Reference]:
-    """The rows of a task and policy."""
-    one_by_one = None if task.reproducible else 1  # a robot may exist once
-    returns = find_player(_POLICIES.get(policy, policy), task).returns(episodes, one_by_one)
-    return [_Reference(task.name, policy, i, rounded(each)) for i, each in enumerate(returns)]
-
-
-def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
-    """Write what evaluations say of the encoders of a study's runs, if any is named.
-
-    Evaluations are matched by the encoders' hashes, the whole observation by the task. What the
-    table says already is kept where they say nothing.
-
-    Args:
-        folder: with the tables of a study.
-        given: folders of evaluations beside those that the study names; {task} stands for each
-            task in turn. The first that knows an encoder counts.
-
-    Returns:
-        A line for each task with representations that no evaluation knows.
-
-    Raises:
-        DamageError: a file is damaged.
-    """
-    path, runs = folder / DIAGNOSTICS, folder / RECORD
-    if not exists(runs):
-        return []
-    record = read_document(runs, RunsRecord)
-    named = record.study.evaluations if record.study else ()
-    if not (given or named or exists(path)):
-        return []
-    used = _encoders(record)
-    known: dict[_Key, Values] = {}
-    for pattern in dict.fromkeys((*given, *named)):
-        files = _files(pattern, (row.task for row in used))
-        if pattern in given and not files:
-            raise InputError(f"no evaluation in {pattern}: jbrep evaluate makes one")
-        for file in files:
-            known = evaluated(file) | known
-    if exists(path):
-        known = _there_too(path, record.tables.get(DIAGNOSTICS), used, known) | known
-    rows = [row._replace(values=known[_key(row)]) for row in used if _key(row) in known]
-    text = diagnostics_text(rows)
-    tables = {**record.tables, DIAGNOSTICS: hash_of(text)}
-    if tables != record.tables:  # a kill in between leaves no hash of another table there
-        others = {name: sha256 for name, sha256 in tables.items() if name != DIAGNOSTICS}
-        record.replace(tables=others).write(runs)
-    write_text(path, text)
-    if tables != record.tables:
-        record.replace(tables=tables).write(runs)
-    return list(_unknown(used, known))
-
-
-def _there_too(
-    path: Path, sha256: str | None, used: Iterable[Diagnosed], known: Mapping[_Key, Values]
-) -> dict[_Key, Values]:
-    """What the table says already; one that is another isn't needed where all is known.
-
-    Args:
-        path: of the table.
-        sha256: of it; None if that isn't known, as where runs.json is written anew.
-        used: encoders.
-        known: of them already.
-
-    Raises:
-        DamageError: the table is another, and some of the encoders are known from it alone.
-    """
-    try:
-        return {_key(row): row.values for row in read_diagnostics(path, sha256)}
-    except DamageError:
-        if all(_key(row) in known for row in used):
-            return {}
-        raise
-
-
-def _encoders(record: RunsRecord) -> list[Diagnosed]:
-    """A row without values for each encoder under each name in each task."""
-    rows = dict.fromkeys(
-        (settings.task, settings.representation, run.encoder)
-        for run in record.runs
-        for settings in [record.labels[run.label].settings]
-    )
-    return [Diagnosed(*row, {}) for row in rows]
-
-
-def _files(pattern: str, tasks: Iterable[str]) -> list[Path]:
-    """The evaluations that a folder's path stands for, as far as they are there."""
-    folders = dict.fromkeys(Path(pattern.replace(_TASK, slug(task))) for task in tasks)
-    return [file for folder in folders if exists(file := folder / EVALUATION)]
-
-
-def evaluated(path: Path) -> dict[_Key, Values]:
-    """The headline numbers in an evaluation."""
-    evaluation = read_document(path, Evaluation)
-    task = evaluation.data.task
-    return {
-        (task, known.sha256 or label): headline(known)
-        for label, known in evaluation.encoders.items()
-        if label == FULL or known.sha256
-    }
-
-
-def _key(row: Diagnosed) -> _Key:
-    return row.task, FULL if row.representation == FULL else row.sha256
-
-
-def _unknown(used: Sequence[Diagnosed], known: Mapping[_Key, Values]) -> Iterator[str]:
-    """What to do about the representations of each task without numbers."""
-    encoders = Counter(row[:2] for row in used)
-    missing = Counter(row[:2] for row in used if _key(row) not in known)
-    names = defaultdict[str, list[str]](list)
-    for (task, name), lacking in missing.items():
-        total = encoders[task, name]
-        names[task].append(name if total == 1 else f"{name} ({lacking} of {total} encoders)")
-    for task, unknown in names.items():
-        yield (
-            f"no diagnostics for {task} of {', '.join(unknown)}: evaluate them, then jbrep report "
-            "--evaluation"
+def check_tables(folder: Path) -> None:
+    """Make sure that a folder has the tables of a study."""
+    if not exists(folder / RECORD):
+        if any(folder.rglob(ENCODER)):
+            raise InputError(f"no run in {folder} has ended yet: report them then")
+        raise InputError(
+            f"{folder} is not the folder of a study: it has neither runs nor a {RECORD}"
         )
+
+
+def read_tables(folder: Path) -> Tables:
+    """The tables in a folder.
+
+    Raises:
+        DamageError: one isn't what was written.
+    """
+    check_tables(folder)
+    record = read_document(folder / RECORD, RunsRecord)
+    known = record.tables
+    infos = read_rows(folder / RUN_INFOS, RunInfo, known[RUN_INFOS]) if RUN_INFOS in known else []
+    return Tables(
+        record,
+        read_rows(folder / RETURNS, Return, known.get(RETURNS, "")),
+        infos,
+        _references(folder, known),
+    )
+
+
+def _references(folder: Path, known: Mapping[str, str]) -> References:
+    """The returns of reference policies, if runs.json knows the table."""
+    found: References = {}
+    if REFERENCE_RETURNS in known:
+        path = folder / REFERENCE_RETURNS
+        for row in read_rows(path, _Reference, known[REFERENCE_RETURNS]):
+            found.setdefault(row.task, {}).setdefault(row.policy, []).append(row.episode_return)
+    return found
+
+
+def write_tables(folder: Path) -> None:
+    """Write the tables of the runs below a folder, of a study or not, as far as they have ended."""
+    ended = _ended(folder)
+    returns, infos = _of_runs(ended, read_evaluations), [*_of_runs(ended, read_infos)]
+    record = RunsRecord.of(folder, ended)
+    tables = dict(_lasting(folder, record.tasks))
+    tables[RETURNS] = write_rows(folder / RETURNS, (Return(*row) for row in returns), Return)
+    if infos:
+        tables[RUN_INFOS] = write_csv(folder / RUN_INFOS, RunInfo._fields, infos)
+    record.replace(tables=tables).write(folder / RECORD)
+
+
+def _lasting(folder: Path, tasks: Mapping[str, Task]) -> Iterator[tuple[str, str]]:
+    """The hashes of tables that aren't made from runs; of policies, if tasks are the same."""
+    try:
+        former = read_document(folder / RECORD, RunsRecord)
+    except InputError:  # it is missing or damaged: it is written anew
+        return
+    alike = all(tasks.get(name, task) == task for name, task in former.tasks.items())
+    of_runs = (RETURNS, RUN_INFOS, *([] if alike else [REFERENCE_RETURNS]))
+    for name, sha256 in former.tables.items():
+        if name not in of_runs and exists(folder / name):
+            yield name, sha256
+
+
+def read_curves(folder: Path) -> list[RunCurve]:
+    """The runs below a folder that have finished or failed, as they are in no table yet."""
+    ended = _ended(folder)
+    returns = [Return(*row) for row in _of_runs(ended, read_evaluations)]
+    return Tables(RunsRecord.of(folder, ended), returns, [], {}).curves()
+
+
+def _ended(folder: Path) -> dict[Path, RunRecord]:
+    """The runs that have ended, by folder."""
+    folders = runs_below(folder)
+    if not folders:
+        resumed = exists(folder / STUDY)
+        what_to_do = (
+            "jbrep study resumes it" if resumed else "train one with jbrep rl or jbrep study"
+        )
+        raise InputError(f"no finished run below {folder}: {what_to_do}")
+    ended = {each: read_run(each) for each in folders}
+    known: dict[tuple[str, int], Path] = {}
+    for each, run in ended.items():
+        other = known.setdefault((run.settings.label, run.settings.seed), each)
+        if other != each:
+            raise InputError(
+                f"{other} and {each} are both seed {run.settings.seed} of {run.settings.label}: "
+                "put runs that differ in anything else in folders of their own"
+            )
+    return ended
+
+
+def _of_runs(
+    ended: Mapping[Path, RunRecord], read: Callable[[Path], Iterable[NamedTuple]]
+) -> Iterator[list[Any]]:
+    """The rows of a table that runs have, each after what tells its run, by label and seed."""
+    runs = ((run.settings, folder) for folder, run in ended.items())
+    for settings, folder in sorted(runs, key=lambda run: (run[0].label, run[0].seed)):
+        key = settings.task, settings.learner, settings.representation, settings.seed
+        for row in read(folder):
+            yield [*key, *row]
+
+
+def play_references(folder: Path) -> None:
+    """Play the policies that runs are compared with, on the starts of their ends.
+
+    What the table has already isn't played again; what can't be played stays in it.
+
+    Raises:
+        DamageError: the table isn't what was written, and can't be played here.
+    """
+    record, damage = read_document(folder / RECORD, RunsRecord), None
+    try:
+        there = _references(folder, record.tables)
+    except DamageError as error:
+        there, damage = {}, error
+    top = record.study.verdicts.reference if record.study else ""
+    further, episodes = [top] if isinstance(top, str) and top else [], dict[str, int]()
+    for label in record.labels.values():
+        own = label.settings
+        episodes[own.task] = max(episodes.get(own.task, 0), own.final_episodes)
+    rows = list[_Reference]()
+    for name, task in sorted(record.tasks.items()):
+        for policy in dict.fromkeys((*policies_of(task), *further)):
+            played = there.get(name, {}).get(policy, [])
+            if len(played) != episodes[name]:
+                try:
+                    played = play(policy, task, episodes[name])
+                except Exception as error:  # what has been trained is reported all the same
+                    told = f"policy {policy!r} couldn't be played on {name}: {error}"
+                    warnings.warn(told, Notice, stacklevel=2)
+            if damage and not played:
+                raise damage
+            rows += (_Reference(name, policy, i, each) for i, each in enumerate(played))
+    if rows:
+        sha256 = write_csv(
+            folder / REFERENCE_RETURNS, ("task", "policy", "episode", "return"), rows
+        )
+        record.with_table(REFERENCE_RETURNS, sha256).write(folder / RECORD)
+
+
+def _curve(tables: Tables, run: RunFacts, by_step: Mapping[int, list[float]]) -> RunCurve:
+    """A run, from its settings without the seed and what that draws, and its returns by step."""
+    record = tables.record
+    shared, top = record.settings_of(run), record.planned.rules.top
+    task, settings, drawn = shared.environment, to_plain(shared), record.draws_of(shared.learner)
+    played = tables.references.get(shared.task, {})  # from the same starts
+    if drawn:  # the overrides say the hyperparameters
+        del settings["hyperparameters"]
+        settings["overrides"] = {n: v for n, v in shared.overrides.items() if n not in drawn}
+    del settings["device"]
+    steps = sorted(by_step)
+    returns = [by_step[step] for step in steps]
+    episodes = min(map(len, returns), default=0)  # the last evaluation may have more
+    if any(len(each) > episodes for each in returns[:-1]):
+        raise InputError(f"run {run.label}, seed {run.seed}: evaluations differ in their episodes")
+    means = {policy: float(np.mean(each)) for policy, each in played.items()}
+    blind = played.get(best_blind(means) or "", ())
+    able = (top,) * shared.final_episodes if isinstance(top, float) else played.get(top, ())
+    return RunCurve(
+        task=task.name,
+        algorithm=shared.learner,
+        representation=shared.representation,
+        seed=run.seed,
+        settings=hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8],
+        steps=np.array(steps, dtype=np.int64),
+        returns=np.array([each[:episodes] for each in returns], float).reshape(
+            -1, max(episodes, 1)
+        ),
+        total_steps=max(run.steps, shared.steps),
+        failed_at=run.steps if run.status == FAILED else None,
+        return_floor=task.return_floor,
+        return_ceiling=task.return_ceiling,
+        reference=_mean(blind[: shared.final_episodes]),
+        reference_in_training=_mean(blind[:episodes]),
+        top=_mean(able[: shared.final_episodes]),
+        top_in_training=_mean(able[:episodes]),
+        solved=task.solved_return,
+        environment=_environment(task),
+        final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
+        encoder_seed=run.encoder_seed,
+    )
+
+
+def _environment(task: Task) -> str:
+    """What decides which returns there can be, as text for a message."""
+    return ", ".join([task.id, *task.given_arguments, counted(task.max_episode_steps, "step")])
+
+
+def _mean(returns: Sequence[float]) -> float | None:
+    return float(np.mean(returns)) if len(returns) else None

@@ -11,9 +11,8 @@ import ray
 from ray.cluster_utils import Cluster
 
 from jbrep.collect import collect
-from jbrep.study.plan import Plan
+from jbrep.study.plan import PROGRESS, Plan
 from jbrep.study.runner import on_ray, run_study
-from jbrep.study.work import PROGRESS
 
 NODE = {"num_cpus": 1, "include_dashboard": False, "include_log_monitor": False}
 CONFIG = {

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from jbrep.cli import main
 from jbrep.errors import InputError
-from jbrep.study.work import work
+from jbrep.study.runner import work
 
 
 def jbrep(*arguments):
@@ -58,7 +58,7 @@ def wait_for(happened, process, seconds=120):
 
 def workers_of(pid):
     """The workers of the study that a process runs."""
-    found = subprocess.run(["pgrep", "-P", str(pid), "-f", "spawn_main"], capture_output=True)
+    found = subprocess.run(["pgrep", "-P", str(pid), "-f", "popen_loky"], capture_output=True)
     return [int(each) for each in found.stdout.split()]
 
 

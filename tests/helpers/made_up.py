@@ -122,7 +122,7 @@ def drawn(plot):
 def make_runs(plan, seeds):
     """Runs as jbrep rl leaves them, of those seeds."""
     for cell in plan.cells:
-        if cell.seed in seeds and not plan.has_ended(cell):
+        if cell.seed in seeds and cell in plan.unfinished:
             _make_run(plan, cell)
 
 
@@ -151,7 +151,7 @@ def of_a_commit():
     """Code and registrations are of a commit in here, also where a contributor has changed some."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Plan, "in_git", True)
-        for module in ("jbrep.study.registration", "jbrep.rl.training"):
+        for module in ("jbrep.study.plan", "jbrep.rl.training"):
             patch.setattr(f"{module}.commits", lambda: COMMITS)
         yield
 

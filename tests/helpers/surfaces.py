@@ -34,9 +34,8 @@ from jbrep.rl.checkpoint import Checkpoint
 from jbrep.rl.files import CHECKPOINT, ENCODER, EVALUATIONS, POLICY, RUN
 from jbrep.rl.tune import BEST, SEARCH
 from jbrep.study.config import Study
-from jbrep.study.plan import Plan
+from jbrep.study.plan import REGISTRATION, Plan, find_committed, registration_in
 from jbrep.study.record import RECORD
-from jbrep.study.registration import REGISTRATION, find_committed, registration_in
 from jbrep.study.runner import run_study
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
 
