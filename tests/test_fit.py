@@ -33,7 +33,7 @@ from jbrep.methods.controls import Full
 from jbrep.methods.fit import Fitter
 from jbrep.methods.held_out import lost, ratio_to_pca
 from jbrep.methods.registry import METHODS, name_of, read_name
-from jbrep.records.lock import exclusive
+from jbrep.records.storage import exclusive
 from jbrep.training import checkpoint
 from jbrep.training.method import USUAL
 from jbrep.training.rows import available_memory

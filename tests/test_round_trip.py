@@ -15,7 +15,7 @@ from jbrep.rl.controller import load_policy
 from jbrep.rl.export import export
 from jbrep.rl.shipped import find
 
-EPISODES, STEPS = 30, 150
+EPISODES, STEPS = 16, 150
 TASK = describe("face_direction", max_episode_steps=STEPS)
 NAMED = ("--time", "time", "--episode", "trial", "--task", "face_direction")
 SEEN = "position*,orientation*,velocity*,angular*,motor*,angle*"

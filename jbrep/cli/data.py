@@ -137,7 +137,7 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
     """
     from jbrep.collect.replay import replay_problems
     from jbrep.dataset import Dataset
-    from jbrep.dataset.verify import find_problems
+    from jbrep.dataset.manifest import find_problems
 
     if _say_all(find_problems(data)):
         ctx.exit(1)
@@ -168,7 +168,7 @@ def _say_all(lines: Iterable[str]) -> bool:
 @threads_option
 def repair(data: Path, lanes: int, threads: int | None) -> None:
     """Make damaged and missing shards again from their seeds."""
-    from jbrep.collect.repair import repair as run
+    from jbrep.collect.replay import repair as run
     from jbrep.play.sources import kept_policy
 
     with stoppable(RESUMES):
@@ -313,8 +313,8 @@ def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
 
 def _layout(options: dict[str, Any]) -> Layout:
     """What the columns are by a file, and by options before it; they are taken out."""
+    from jbrep.records.document import read_toml
     from jbrep.records.record import from_plain
-    from jbrep.records.toml import read_toml
 
     given = {name: options.pop(name) for name in Layout.__struct_fields__}
     path = options.pop("layout")

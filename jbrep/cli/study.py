@@ -61,8 +61,8 @@ def study(
     or killed, the same command resumes the study; runs that have ended are never run again.
     """
     from jbrep.errors import InputError, choose
+    from jbrep.records.document import read_toml
     from jbrep.records.storage import exists
-    from jbrep.records.toml import read_toml
 
     if dry_run and register:
         raise InputError("--dry-run and --register exclude each other: choose one")

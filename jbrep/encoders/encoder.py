@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, Union
 import numpy as np
 
 from jbrep.coordinates import is_torch, library_of
-from jbrep.coordinates.nearest import nearest
+from jbrep.coordinates.placing import nearest
 from jbrep.dataset import Scaler
 from jbrep.encoders.base import BaseEncoder, Float32, OwnEncoder
 from jbrep.encoders.header import IMPORTED, EncoderHeader

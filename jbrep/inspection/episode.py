@@ -7,8 +7,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.coordinates.nearest import continuous
-from jbrep.coordinates.placing import placed
+from jbrep.coordinates.placing import continuous, placed
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array

@@ -23,8 +23,7 @@ from jbrep.methods.registry import METHODS, get_method, name_of
 from jbrep.methods.shape import complete
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
-from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder
+from jbrep.records.storage import exclusive, exists, make_folder
 from jbrep.training import checkpoint
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method, Reconstructing
 from jbrep.training.trainer import Epoch, Trainer, default_batch_size, get_device, single_thread

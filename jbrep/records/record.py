@@ -11,7 +11,8 @@ https://jcristharif.com/msgspec/constraints.html
 
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from typing import Annotated, Any, Self, TypeVar
 
 import msgspec
@@ -28,7 +29,6 @@ Finite = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 Version = Annotated[str, Meta(pattern=r"(?a)\A\w[\w.+!-]*\Z")]  # or the name of a package
 Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z")]
 
-_MESSAGE = re.compile(r"(.*?)(?: - at `\$(.*)`)?", re.DOTALL)  # msgspec's, and where
 _FIELD = re.compile(r"Object (missing required|contains unknown) field `(.*)`")
 _STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]")
 _WITH_PARTS = (
@@ -61,12 +61,9 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def from_plain(value: Any, kind: type[_Kind], where: str = "") -> _Kind:
-    """A record, or any other type, from plain JSON or TOML.
+    """A record, or another class, from plain JSON or TOML.
 
-    Args:
-        value: as json.loads or tomllib.loads return it.
-        kind: the class, or another type that msgspec knows.
-        where: the value stands, for messages: "data" makes them speak of data.steps.
+    What it is called in messages is `where`: "data" makes them speak of data.steps.
     """
     return converted(value, kind, where)
 
@@ -95,13 +92,12 @@ def converted(value: Any, kind: Any, where: str, strict: bool = True) -> Any:
 
 def _line(message: str, value: Any, kind: Any, where: str) -> str:
     """A message of msgspec's as a line with the place, the value and what that must be."""
-    found = _MESSAGE.fullmatch(message)
-    reason, path = found.groups("") if found else (message, "")
-    place = f"{where}{path}".removeprefix(".")
-    nodes = [*_plain([type_of(kind)])]
-    for field, index in _STEP.findall(path):
-        nodes = [*_plain(part for each in nodes for part in _parts(each, field or index))]
-        value = _inside(value, field or index)
+    reason, _, path = message.partition(" - at `$")
+    path = path.removesuffix("`")
+    steps = [field or index for field, index in _STEP.findall(path)]
+    place, nodes = f"{where}{path}".removeprefix("."), [*_at(type_of(kind), steps)]
+    for step in steps:
+        value = _inside(value, step)
     if field := _FIELD.fullmatch(reason):
         name = f"{place}.{field[2]}" if place else field[2]
         if field[1].startswith("missing"):
@@ -110,7 +106,7 @@ def _line(message: str, value: Any, kind: Any, where: str) -> str:
     if reason.startswith("Expected "):
         must_be = reason.removeprefix("Expected ").partition(", got")[0]
     elif reason.startswith("Invalid "):
-        must_be = _choices(nodes, "one of ")
+        must_be = _choices(nodes, "one of ") or "another"
     else:  # what `check` said
         return f"{place}: {reason}" if place else reason
     given = "" if value is UNSET else f" is {shown(value)}: it"
@@ -125,30 +121,22 @@ def _inside(value: Any, step: str) -> Any:
         return getattr(value, step, UNSET)
 
 
-def _plain(nodes: Iterable[inspect.Type]) -> Iterator[inspect.Type]:
-    """Types without their descriptions; of a union its parts."""
-    for node in nodes:
-        match node:
-            case inspect.Metadata(type=inner):
-                yield from _plain([inner])
-            case inspect.UnionType(types=types):
-                yield from _plain(types)
-            case _:
-                yield node
-
-
-def _parts(node: inspect.Type, step: str) -> list[inspect.Type]:
-    """The types that a part of a value may have, of that field or at that place."""
+def _at(node: inspect.Type, steps: Sequence[str] = ()) -> Iterator[inspect.Type]:
+    """The types that a part of a value may have, or the value itself without any steps."""
     match node:
-        case inspect.StructType(array_like=True, fields=fields):
-            return [fields[int(step)].type]
-        case inspect.StructType(tag_field=tag_field, tag=tag) if step == tag_field:
-            return [inspect.LiteralType((tag,))]
+        case inspect.Metadata(type=inner):
+            yield from _at(inner, steps)
+        case inspect.UnionType(types=types):
+            yield from chain(*(_at(each, steps) for each in types))
+        case _ if not steps:
+            yield node
+        case inspect.StructType(tag_field=tag_field, tag=tag) if tag_field == steps[0]:
+            yield inspect.LiteralType((tag,))
         case inspect.StructType(fields=fields):
-            return [each.type for each in fields if each.encode_name == step]
+            found = (each.type for each in fields if each.encode_name == steps[0])
+            yield from chain(*(_at(each, steps[1:]) for each in found))
         case inspect.CollectionType(item_type=item) | inspect.DictType(value_type=item):
-            return [item]
-    return []
+            yield from _at(item, steps[1:])
 
 
 def _choices(nodes: Sequence[inspect.Type], before: str) -> str:
@@ -166,7 +154,7 @@ def type_of(kind: Any) -> inspect.Type:
 
 def bare(node: inspect.Type) -> inspect.Type:
     """A type without its description; of a union a list or table, or else the first part."""
-    return max(_plain([node]), key=lambda each: isinstance(each, _WITH_PARTS))
+    return max(_at(node), key=lambda each: isinstance(each, _WITH_PARTS))
 
 
 def to_plain(value: Any) -> Any:

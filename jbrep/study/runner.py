@@ -15,8 +15,7 @@ from rich.table import Table
 from jbrep.envs.names import imported_modules
 from jbrep.machine import cores
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
-from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder
+from jbrep.records.storage import exclusive, exists, make_folder
 from jbrep.rl.files import FAILED, FINISHED, read_run
 from jbrep.rl.settings import CPU, CUDA
 from jbrep.rl.training import drop_checkpoint, standing_of

@@ -101,7 +101,6 @@ def _leaves(frame: Frame, column: pa.Field) -> Iterator[Leaf]:
 
 
 def _said(layout: Layout) -> dict[str, tuple[str, ...]]:
-    """The names of columns that a layout says, by what they are."""
     once = {role: getattr(layout, role) for role in ("time", "episode", "terminated", "reward")}
     said = {role: (name,) for role, name in once.items() if name}
     wide = {"action": layout.actions, "observation": layout.observations}
