@@ -24,7 +24,7 @@ from jbrep import jitterbug
 from jbrep.collect import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.envs import describe
-from jbrep.jitterbug.model import PHYSICS_STEPS, fast_model, stop_profiling
+from jbrep.jitterbug.simulation import PHYSICS_STEPS, fast_model, stop_profiling
 from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS
 
 TASK = "face_direction"

@@ -23,7 +23,7 @@ from timing import show
 import jbrep.envs  # noqa: F401 (registers the environments)
 from jbrep import JitterbugVecEnv, jitterbug
 from jbrep.jitterbug import environment_id
-from jbrep.jitterbug.model import PHYSICS_STEPS, fast_model, stop_profiling
+from jbrep.jitterbug.simulation import PHYSICS_STEPS, fast_model, stop_profiling
 from jbrep.jitterbug.tasks import EPISODE_STEPS
 
 TASK = "move_in_direction"

@@ -11,7 +11,6 @@ _Choice = TypeVar("_Choice")
 _MOST_NAMES = 20
 _MOST_SHOWN = 3  # settings that differ
 _MOST_LETTERS = 40  # of a value
-_BEFORE = 10  # letters that are shown before where two values differ
 
 
 class InputError(ValueError):
@@ -23,7 +22,7 @@ class Notice(UserWarning):
 
 
 class DamageError(InputError):
-    """A file is not what jbrep wrote; the message names it."""
+    """A file is not what jbrep wrote; the message names it. Whatever reads one may raise it."""
 
 
 class StoppedError(Exception):
@@ -53,14 +52,7 @@ def refusing(
     told: Callable[[Any], str] = kind_and_line,
     kind: type[InputError] = InputError,
 ) -> Iterator[None]:
-    """Let what goes wrong be a user's mistake, told in a line; one that is already, stays.
-
-    Args:
-        what: failed, or can't be, for the message.
-        errors: that may come of it.
-        told: what says in a line why.
-        kind: of the error that is raised instead.
-    """
+    """Let errors of these classes be a user's mistake: what can't be, and why, told in a line."""
     try:
         yield
     except InputError:
@@ -109,9 +101,9 @@ def listed(names: Sequence[str]) -> str:
 
 def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
     """The settings that differ, as text for a message: at most three; empty if none does."""
-    differing = list(_differing(there, wanted))
+    differing = [*_differing(there, wanted)]
     shown = [
-        "{} {} (now: {})".format(name, *_shown(_word(before), _word(now)))
+        name if before == now else f"{name} {before} (now: {now})"
         for name, before, now in differing[:_MOST_SHOWN]
     ]
     more = len(differing) - _MOST_SHOWN
@@ -120,45 +112,19 @@ def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
 
 def _differing(
     there: Mapping[str, Any], wanted: Mapping[str, Any], where: str = ""
-) -> Iterator[tuple[str, Any, Any]]:
-    """The settings that differ, of tables the entries that do.
-
-    Lists of tables that have names, such as features, count as tables if the names are alike.
-    """
+) -> Iterator[tuple[str, str, str]]:
+    """The settings that differ, of tables the entries that do, as short text."""
     for name in {**wanted, **there}:
         before, now = there.get(name), wanted.get(name)
-        if (known := _named(before)) and (given := _named(now)):
-            alike = [*known] == [*given]
-            before, now = (known, given) if alike else ([*known], [*given])
         if isinstance(before, Mapping) and isinstance(now, Mapping):
             yield from _differing(before, now, f"{where}{name}.")
         elif before != now:
-            yield f"{where}{name}", before, now
-
-
-def _named(value: Any) -> dict[str, Any]:
-    """A list of tables that have names of their own, as a table of them; of all else none."""
-    if not isinstance(value, list | tuple):
-        return {}
-    tables = {each["name"]: each for each in value if isinstance(each, Mapping) and "name" in each}
-    return tables if len(tables) == len(value) else {}
+            yield f"{where}{name}", _word(before), _word(now)
 
 
 def _word(value: Any) -> str:
-    """A setting as files spell it."""
+    """A setting as files spell it, cut where it is long."""
     if value is None:
         return "none"
-    return value if isinstance(value, str) else json.dumps(value, default=str, ensure_ascii=False)
-
-
-def _shown(*texts: str) -> Iterator[str]:
-    """Texts that are cut where they are long, from a little before where they differ on."""
-    pairs = enumerate(zip(*texts, strict=False))
-    alike = next((place for place, letters in pairs if len({*letters}) > 1), min(map(len, texts)))
-    begin = alike - _BEFORE if alike > _MOST_LETTERS // 2 else 0
-    for text in texts:
-        if len(text) > _MOST_LETTERS:
-            text = f"...{text[begin:]}" if begin else text
-            some = _MOST_LETTERS + 3 if begin else _MOST_LETTERS
-            text = text if len(text) <= some else f"{text[: some - 3]}..."
-        yield text
+    text = value if isinstance(value, str) else json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= _MOST_LETTERS else f"{text[: _MOST_LETTERS - 3]}..."

@@ -116,11 +116,8 @@ def rounded(*values: float) -> list[str]:
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], width: int | None = None) -> str:
     """Columns side by side: the first aligned on the left, the others on the right.
 
-    Args:
-        header: a name for each column.
-        rows: a cell for each column.
-        width: a wider table is cut into parts, one below the other, each with the first column;
-            None leaves it whole.
+    A table of more than `width` characters is cut into parts, one below the other, each with the
+    first column.
     """
     lines = [header, *rows]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]

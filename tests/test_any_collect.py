@@ -13,14 +13,12 @@ from small import contents, settings
 from jbrep.collect import backends, collect
 from jbrep.collect.derive import derive
 from jbrep.collect.policies import Uniform
-from jbrep.collect.repair import repair
-from jbrep.collect.replay import replay_problems
+from jbrep.collect.replay import repair, replay_problems
 from jbrep.collect.shards import Growth, Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export
-from jbrep.dataset.manifest import new_manifest, read_manifest
+from jbrep.dataset.manifest import find_problems, new_manifest, read_manifest
 from jbrep.dataset.schema import episode_seed
-from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError
@@ -89,9 +87,8 @@ def test_an_episode_is_the_one_that_gymnasium_s_environment_has(sledges):
         assert (terminated, truncated) == (ends["terminated"], ends["truncated"])
 
 
-@pytest.mark.parametrize("workers", [2, 3])
-def test_the_number_of_processes_changes_no_byte(workers, sledges, tmp_path):
-    collect(some(), tmp_path / "data", num_threads=workers)
+def test_the_number_of_processes_changes_no_byte(sledges, tmp_path):
+    collect(some(), tmp_path / "data", num_threads=2)
     assert contents(tmp_path / "data") == contents(sledges)
 
 
@@ -203,9 +200,8 @@ def test_a_shard_that_fails_doesn_t_matter_until_it_is_needed(tmp_path):
         next(shards)
 
 
-@pytest.mark.parametrize("name", ["Moody", "Worn"])
-def test_a_data_set_of_what_is_not_reproducible_says_so(name, tmp_path):
-    data, env_id = tmp_path / "data", f"Sledges/{name}-v0"
+def test_a_data_set_of_what_is_not_reproducible_says_so(tmp_path):
+    data, env_id = tmp_path / "data", "Sledges/Moody-v0"
     command = ("collect", "--task", env_id, "--steps", 90, "--threads", 1, "--out", data)
     told = jbrep(*command)
     assert f"{env_id} is not reproducible: no episode can be simulated again" in told.stderr
@@ -239,35 +235,6 @@ def test_arrays_of_states_are_stored_and_compared(tmp_path):
     for name in ("reward", "length", "policy", "final_heat"):
         with pytest.raises(InputError, match=f"has an array '{name}': data sets have such"):
             some(task.replace(state={name: 1}))
-
-
-def test_an_unwrapped_time_limit_and_flattened_dictionaries(tmp_path):
-    endless = describe("Sledges/Endless-v0", {"rail": 99.0}, 12)
-    collect(some(endless, steps=25), tmp_path / "endless", num_threads=1)
-    episodes = Dataset(tmp_path / "endless").episodes
-    assert episodes["length"].tolist() == [12, 12, 12]
-    assert (episodes["truncated"].tolist(), episodes["terminated"].any()) == ([1, 1, 1], False)
-    nested = describe("Sledges/Nested-v0")
-    collect(some(nested, steps=60), tmp_path / "nested", num_threads=1)
-    dataset = Dataset(tmp_path / "nested")
-    assert dataset["signs.part1"].shape == (len(dataset), 3)
-    np.testing.assert_array_equal(dataset["signs.part1"][:].argmax(1), dataset["step"][:] % 3)
-    assert not list(replay_problems(dataset, 3))
-
-
-def test_actions_are_stepped_in_the_32_bits_that_are_stored(tmp_path):
-    exact = describe("Sledges/Exact-v0")
-    for kind in ({"kind": "uniform"}, {"kind": "constant", "drive": 1}):
-        collect(some(exact, steps=20, policy=kind), tmp_path / kind["kind"], num_threads=1)
-        dataset = Dataset(tmp_path / kind["kind"])
-        assert dataset.episodes["length"].tolist() == [7, 7, 7]
-        assert dataset.episodes["terminated"].all()
-        assert dataset.episodes["truncated"].all()
-        seen, later = dataset["observation"][:], dataset["step"][:] > 0
-        np.testing.assert_array_equal(seen[later][:, 1], 0)
-        before = np.roll(dataset["action"][:][:, 0], 1)
-        np.testing.assert_array_equal(seen[later][:, 0], before[later])
-        assert not list(find_problems(tmp_path / kind["kind"]))
 
 
 def test_arguments_are_settings(sledges, tmp_path):

@@ -4,10 +4,7 @@ import subprocess
 import sys
 
 NAMES = (  # the quick ones; tools/attack.py without names attacks all
-    *("checkpoints of sac", "checkpoints of ppo", "rl --from", "inspect", "render"),
-    *("import of parquet", "import of minari", "import of csv"),
-    *("import of a bag of ROS 1", "import of mcap", "import of a bag of ROS 2"),
-    *("import of lerobot", "import of d4rl", "import of robomimic"),
+    *("checkpoints of sac", "rl --from", "inspect", "import of parquet", "import of mcap"),
     *("encoder import", "registration"),
 )
 

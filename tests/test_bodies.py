@@ -7,7 +7,7 @@ from command import refused
 
 from jbrep.jitterbug import bodies
 from jbrep.jitterbug.bodies import check_body, draw, number_of
-from jbrep.jitterbug.model import fast_model, plain_model
+from jbrep.jitterbug.simulation import fast_model, plain_model
 
 NUMBERS = (0, 2**31 - 1)
 DRAWN = ("knees", "feet", "weight", "weight_size", "densities", "gear")

@@ -15,8 +15,7 @@ from jbrep.coordinates import INGREDIENTS, Coordinates, make_coordinates
 from jbrep.coordinates.coordinates import Part
 from jbrep.coordinates.formulas import FORMULAS
 from jbrep.coordinates.invariance import check_invariant
-from jbrep.coordinates.nearest import continuous, nearest
-from jbrep.coordinates.placing import placed
+from jbrep.coordinates.placing import continuous, nearest, placed
 from jbrep.dataset import DataSettings
 from jbrep.encoders import find
 from jbrep.envs.description import describe
@@ -67,7 +66,7 @@ def test_coordinates_lose_nothing(name, system):
 
 
 @pytest.mark.parametrize("system", ["coordinates", "symmetry"])
-@pytest.mark.parametrize("near", [0, 1e-9, 1e-4, 1e-2, 1])
+@pytest.mark.parametrize("near", [0, 1e-4, 1])
 def test_a_robot_on_its_back_stays_there(near, system):
     about, w, z = np.random.default_rng(0).uniform(-1, 1, (3, 200))
     columns = np.array([near * w, np.cos(np.pi * about), np.sin(np.pi * about), near * z])
@@ -257,19 +256,6 @@ def test_kinds_follow_from_mujocos_model():
         ("vector", "world"),
         ("vector", "world"),
     ]
-
-
-@pytest.mark.parametrize(
-    ("env", "said"),
-    [
-        ("Ant-v5", "Ant-v5 isn't the same for a turned robot: the reward is"),
-        ("Swimmer-v5", "the reward"),
-    ],
-)
-def test_symmetry_is_tried_not_believed(env, said):
-    task = describe(env)
-    with pytest.raises(InputError, match=said):
-        check_invariant(make_coordinates(task, "symmetry"))
 
 
 def test_symmetry_is_refused_whatever_the_unit_of_the_reward():

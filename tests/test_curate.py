@@ -7,12 +7,11 @@ from small import contents, flip_bit, settings, written
 
 from jbrep.collect import collect
 from jbrep.collect.derive import derive
-from jbrep.collect.repair import repair
-from jbrep.collect.replay import replay_problems
+from jbrep.collect.replay import repair, replay_problems
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.manifest import MANIFEST, commit, open_shard, read_manifest, write_manifest
 from jbrep.errors import InputError
-from jbrep.jitterbug import model
+from jbrep.jitterbug import bodies, simulation
 from jbrep.jitterbug.tasks import TASKS
 
 
@@ -31,12 +30,8 @@ def test_replayed_episodes_are_equal_bit_for_bit(collected):
         ("action", 10),
         ("reward", 99),
         ("qvel", 50),
-        ("episodes/initial_qpos", 0),
-        ("episodes/initial_qvel", 0),
         ("episodes/target_position", 0),
-        ("episodes/target_quaternion", 0),
         ("episodes/final_observation", 0),
-        ("episodes/final_qpos", 0),
     ],
 )
 def test_replay_finds_one_bit_of_difference(name, row, brief, tmp_path):
@@ -102,14 +97,6 @@ def test_a_damaged_source_is_found_before_anything_is_written(copied, tmp_path):
     assert not (tmp_path / "derived").exists()
 
 
-def test_repair_leaves_a_whole_data_set_alone(copied):
-    before = contents(copied)
-    assert not list(repair(copied))
-    assert contents(copied) == before
-    with pytest.raises(InputError, match="number of lanes is 0"):
-        list(repair(copied, lanes=0))
-
-
 def test_repair_makes_everything_again_as_it_was(copied, collected):
     (copied / "shard-00001.h5").unlink()
     flip_bit(copied / "shard-00003.h5", 56_000)
@@ -151,10 +138,12 @@ def test_states_of_an_earlier_jbrep_are_derived_from_if_the_robot_is_the_same(
 ):
     manifest = read_manifest(copied)
     write_manifest(copied, manifest.replace(versions={**manifest.versions, "jbrep": "0.0.9"}))
-    heavier = model.read_xml().replace('density="7700"', 'density="7701"')
+    heavier = bodies.read_xml().replace('density="7700"', 'density="7701"')
     with monkeypatch.context() as changed:
-        changed.setattr(model, "read_xml", lambda: heavier)
-        changed.setattr(model, "fast_model", model.fast_model.__wrapped__)  # without its cache
+        changed.setattr(bodies, "read_xml", lambda: heavier)
+        changed.setattr(
+            simulation, "fast_model", simulation.fast_model.__wrapped__
+        )  # without its cache
         with pytest.raises(InputError, match="needs the same states"):
             derive(copied, "move_to_pose", tmp_path / "derived")
     assert not (tmp_path / "derived").exists()

@@ -53,11 +53,9 @@ def test_it_draws_something_to_see_whether_it_can(monkeypatch):
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("width", [60, 80])
-def test_it_fits_the_terminal(width, monkeypatch):
-    monkeypatch.setenv("COLUMNS", str(width))
-    lines = jbrep("doctor").output.splitlines()
-    assert max(map(len, lines)) <= width
+def test_it_fits_the_terminal(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    assert max(map(len, jbrep("doctor").output.splitlines())) <= 60
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -88,7 +86,6 @@ def test_an_extra_left_out_is_named_with_what_it_is_for(monkeypatch):
     ("versions", "problem"),
     [
         ({"mujoco": "4.0.0"}, "core mujoco 4.0.0 (<4,>=3.17 is needed), for the robot and"),
-        ({"torch": "2.1.0"}, "learn torch 2.1.0 (>=2.8 is needed), for train-dae"),
         ({"h5py": None, "numpy": "1.26.4"}, "core numpy 1.26.4 (>=2 is needed), no h5py, for"),
     ],
 )

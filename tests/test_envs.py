@@ -13,15 +13,13 @@ from gymnasium.envs.mujoco.utils import check_mujoco_reset_state
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-import jbrep
-from jbrep import envs, jitterbug
 from jbrep.errors import InputError
 from jbrep.jitterbug import JitterbugVectorEnv, environment_id
 from jbrep.jitterbug.tasks import TASKS
 
 IDS = [environment_id(task) for task in TASKS]
 FACE = environment_id("face_direction")
-PACKAGES = (jbrep, envs, jitterbug)
+FIRST = [("jbrep", "train"), ("jbrep.envs", "Lanes"), ("jbrep.jitterbug", "JitterbugEnv")]
 
 
 def test_the_ids():
@@ -34,9 +32,8 @@ def test_the_ids():
     ]
 
 
-@pytest.mark.parametrize("order", ["jbrep, gymnasium", "gymnasium, jbrep"])
-def test_importing_jbrep_registers_them_in_any_order(order):
-    code = f"import {order}; print(gymnasium.spec('{FACE}').max_episode_steps)"
+def test_importing_jbrep_after_gymnasium_registers_them():
+    code = f"import gymnasium, jbrep; print(gymnasium.spec('{FACE}').max_episode_steps)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "1000\n"
 
@@ -46,7 +43,7 @@ def test_whatever_is_imported_first():
     code = f"""
 import mujoco, os, sys, torch
 assert not [name for name in sys.modules if name.startswith(("jbrep.", "gymnasium"))]
-for package, name in {[(p.__name__, name) for p in PACKAGES for name in p.__all__]}:
+for package, name in {FIRST}:
     if os.fork() == 0:
         exec(f"from {{package}} import {{name}}; import gymnasium; gymnasium.spec('{FACE}')")
         os._exit(0)
@@ -55,44 +52,27 @@ for package, name in {[(p.__name__, name) for p in PACKAGES for name in p.__all_
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_gymnasium_s_environments_need_no_torch():
-    code = (
-        f"import sys, jbrep, gymnasium; gymnasium.make('{FACE}'); assert 'torch' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 @pytest.mark.filterwarnings("ignore:.*-?infinity. This is probably too")  # no state is bounded
-@pytest.mark.parametrize(("env_id", "form"), [*((name, "flat") for name in IDS), (FACE, "dict")])
-def test_checkers(env_id, form):
-    environment = gymnasium.make(env_id, form=form)
-    renders = HEADLESS and form == "dict"
-    check_env(environment.unwrapped, skip_render_check=not renders)
+@pytest.mark.parametrize("env_id", [FACE, IDS[-1]])
+def test_checkers(env_id):
+    environment = gymnasium.make(env_id)
+    check_env(environment.unwrapped, skip_render_check=env_id != FACE or not HEADLESS)
     check_mujoco_reset_state(environment)
     sb3_check_env(environment)
 
 
-def test_forms_and_scaling_agree():
-    task = TASKS["move_to_pose"]
-    found = {}
-    for form in ("flat", "dict"):
-        for scaled in (False, True):
-            environment = gymnasium.make(environment_id(task.name), form=form, scaled=scaled)
-            environment.reset(seed=2)
-            found[form, scaled] = environment.step(np.array([0.7], np.float32))[0]
-    raw = found["flat", False]
-    assert raw.dtype == np.float32
-    np.testing.assert_allclose(found["flat", True], task.plain.scale(raw), rtol=1e-5, atol=1e-6)
+def test_scaled_observations():
+    task, found = TASKS["move_to_pose"], []
     for scaled in (False, True):
-        parts = found["dict", scaled]
-        assert list(parts) == [o.name for o in task.observables]
-        np.testing.assert_array_equal(np.concatenate(list(parts.values())), found["flat", scaled])
+        environment = gymnasium.make(environment_id(task.name), scaled=scaled)
+        environment.reset(seed=2)
+        found.append(environment.step(np.array([0.7], np.float32))[0])
+    np.testing.assert_allclose(found[1], task.plain.scale(found[0]), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("env_id", IDS)
-def test_the_time_limit_truncates_and_never_terminates(env_id, monkeypatch):
+def test_the_time_limit_truncates_and_never_terminates(monkeypatch):
     monkeypatch.setattr("jbrep.jitterbug.simulation.Simulation.step", lambda *_: np.zeros(1, bool))
-    environment = gymnasium.make(env_id)
+    environment = gymnasium.make(FACE)
     environment.reset(seed=0)
     ends = [environment.step(environment.action_space.sample())[2:4] for _ in range(1000)]
     assert not any(terminated for terminated, _ in ends)
@@ -123,7 +103,7 @@ def test_many_robots_are_one_repeated_with_its_own_seed():
 
 
 def test_many_robots_conform_to_their_spaces_and_work_under_wrappers():
-    many = gymnasium.make_vec(FACE, num_envs=2, form="dict", max_episode_steps=5)
+    many = gymnasium.make_vec(FACE, num_envs=2, max_episode_steps=5)
     many = gymnasium.wrappers.vector.RecordEpisodeStatistics(many)
     observation, _ = many.reset(seed=[3, 9])
     total = np.zeros(2)
@@ -185,7 +165,7 @@ def test_missing_opengl_is_said_in_one_line_and_all_else_works(monkeypatch):
 
 def test_mistakes_are_named():
     next_step = gymnasium.vector.AutoresetMode.NEXT_STEP
-    for name, value in (("form", "image"), ("dtype", "float16"), ("autoreset_mode", next_step)):
+    for name, value in (("dtype", "float16"), ("autoreset_mode", next_step)):
         assert str(value) in refused(lambda: gymnasium.make_vec(FACE, **{name: value}))  # noqa: B023
     assert "lanes" in refused(lambda: gymnasium.make_vec(FACE, num_envs=0))
     many = gymnasium.make_vec(FACE, num_envs=2)
@@ -219,10 +199,7 @@ def test_a_window_without_a_display_is_refused_in_one_line():
         gymnasium.make(FACE, camera="side")
     done = without_a_display(f"gymnasium.make('{FACE}', render_mode='human')")
     assert done.returncode == 1  # an abort of the process has another
-    assert done.stderr.splitlines()[-1] == (
-        "jbrep.errors.InputError: render_mode 'human' is not possible here: choose one of "
-        "rgb_array, depth_array; human needs a display"
-    )
+    assert "jbrep.errors.InputError: render_mode 'human'" in done.stderr.splitlines()[-1]
 
 
 @needs_egl

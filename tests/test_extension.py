@@ -13,10 +13,9 @@ from small import brief, contents, write_again, written
 
 from jbrep.collect import collect
 from jbrep.collect.derive import derive
-from jbrep.collect.repair import repair
+from jbrep.collect.replay import repair
 from jbrep.dataset import Dataset
-from jbrep.dataset.manifest import MANIFEST, read_manifest, write_manifest
-from jbrep.dataset.verify import find_problems
+from jbrep.dataset.manifest import MANIFEST, find_problems, read_manifest, write_manifest
 from jbrep.errors import InputError
 
 

@@ -26,7 +26,7 @@ from jbrep.methods.autoencoder import DAE
 from jbrep.methods.fit import Fitter
 from jbrep.methods.linear import lost, ratio_to_pca
 from jbrep.methods.registry import METHODS, read_name
-from jbrep.records.lock import exclusive
+from jbrep.records.storage import exclusive
 from jbrep.training.method import USUAL
 from jbrep.training.trainer import Schedule, Trainer
 from jbrep.training.windows import Windows

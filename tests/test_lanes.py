@@ -173,14 +173,3 @@ def test_actions_are_stepped_as_they_are_stored():
         observation = lanes.step(np.array(action)).observation
         np.testing.assert_array_equal(observation[:, 0], np.float32(action)[:, 0])
         np.testing.assert_array_equal(observation[:, 1], 0)
-
-
-def test_what_was_given_before_doesn_t_change():
-    lanes = Lanes(SLEDGE, 2)
-    first = lanes.reset([0, 1], [0, 1])
-    kept = first.copy()
-    step = lanes.step(np.zeros((2, 3)) + 0.2)
-    later = step.observation.copy()
-    lanes.step(np.zeros((2, 3)) + 0.2)
-    np.testing.assert_array_equal(first, kept)
-    np.testing.assert_array_equal(step.observation, later)

@@ -8,10 +8,10 @@ from small import contents, settings
 from jbrep.collect import collect
 from jbrep.collect.derive import derive
 from jbrep.collect.policies import parse_policy
-from jbrep.collect.repair import repair
+from jbrep.collect.replay import repair
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export
-from jbrep.dataset.verify import find_problems
+from jbrep.dataset.manifest import find_problems
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from conftest import needs_egl
 
-from jbrep.jitterbug.model import PHYSICS_STEPS, PHYSICS_TIMESTEP, fast_model, plain_model
+from jbrep.jitterbug.simulation import PHYSICS_STEPS, PHYSICS_TIMESTEP, fast_model, plain_model
 
 STEEL, PLASTIC = 7700, 1100  # [kg/m^3]
 ROD = 0.00061  # radius [m]
@@ -175,7 +175,7 @@ def drive(model, data, action, seconds):
     return np.mean(velocities[len(velocities) // 2 :])
 
 
-@pytest.mark.parametrize("action", [-1, -0.6, -0.3, 0.3, 0.6, 1])
+@pytest.mark.parametrize("action", [-0.6, 0.3, 1])
 def test_constant_drive_spins_the_weight(model, data, action):
     assert drive(model, data, action, 2) == pytest.approx(145 * action, rel=0.05)
 

@@ -359,7 +359,7 @@ def test_an_encoded_environment_shows_latents():
 def test_latents_are_those_of_the_vec_env_to_the_bit(lanes):
     ours = JitterbugVecEnv("face_direction", lanes, 3, find("dae-8", "face_direction"), 1, 10)
     if lanes == 1:
-        theirs = DummyVecEnv([lambda: Encoded(one(form="dict"), "dae-8")])
+        theirs = DummyVecEnv([lambda: Encoded(one(), "dae-8")])
         theirs.seed(3)
         first = theirs.reset()
     else:
@@ -394,7 +394,7 @@ def test_environments_that_an_encoder_can_t_read(env, message):
 
 
 def test_a_task_that_is_given_must_have_as_many_features():
-    bare = JitterbugEnv("face_direction", form="dict")
+    bare = JitterbugEnv("face_direction")
     assert Encoded(bare, "dae-8", "face_direction").reset(seed=0)[0].shape == (8,)
     assert "have 16 numbers, where move_to_pose has 19" in refused(
         Encoded, bare, "dae-8", "move_to_pose"

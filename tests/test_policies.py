@@ -19,7 +19,6 @@ from jbrep.collect.policies import (
 from jbrep.dataset.schema import episode_part
 from jbrep.envs import Feature, Task, describe
 from jbrep.errors import InputError
-from jbrep.jitterbug.heuristics import HEURISTICS
 
 TASK = describe("face_direction")
 ARM = Task(
@@ -65,13 +64,6 @@ def test_ornstein_uhlenbeck_noise_has_the_spread_and_memory_of_its_constants():
     assert np.corrcoef(now, later)[0, 1] == pytest.approx(np.exp(-5 * 0.2), abs=0.03)
 
 
-def test_a_constant_drive_and_the_hand_written_policy():
-    assert np.unique(drives(Constant(-0.3))) == -0.3
-    assert Heuristic().begin(TASK, []) is HEURISTICS["face_direction"]
-    with pytest.raises(InputError, match="Arm-v0 has no hand-written policy: choose another"):
-        Heuristic().begin(ARM, [])
-
-
 def test_episodes_have_streams_of_their_own():
     """What an episode's generator gives doesn't depend on those beside it."""
     both = drives(Uniform(), lanes=2)
@@ -100,21 +92,12 @@ def test_policies_as_people_write_them(text, policy):
         ("sprint", "unknown policy 'sprint': choose one of uniform, still, heuristic"),
         ("constant:speed=1", "unknown constant.speed: it must be one of drive"),
         ("uniform:low=0", "unknown uniform.low: there are none"),
-        ("constant:kind=heuristic", "unknown constant.kind"),
-        ("constant:drive", "constant.drive is ''"),
         ("constant:drive=fast", "constant.drive is 'fast'"),
         ("constant:drive=2", "constant.drive is 2.0"),
         ("constant:drive=nan", "constant.drive is nan"),
         ("ornstein-uhlenbeck:theta=-1", "theta is -1.0"),
-        ("ornstein-uhlenbeck:sigma=1e15", "ornstein-uhlenbeck.sigma"),
-        ("uniform+heuristic", "unknown policy 'uniform\\+heuristic': choose one of uniform"),
         ("uniform:0.5+heuristic", "weight 'heuristic' must be a positive number"),
         ("uniform:1e308+uniform:1e308", "weight '1e308' must be a positive number below 1e12"),
-        (
-            "uniform:0+heuristic:1",
-            "weight '0' must be a positive number below 1e12: each",
-        ),
-        ("uniform:0.5+heuristic:nan", "weight 'nan' must be a positive number"),
         ("uniform:0.5+sprint:0.5", "unknown policy 'sprint'"),
     ],
 )

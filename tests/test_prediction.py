@@ -45,7 +45,7 @@ class Cart:
     wanders by itself, and nothing depends on it. The reward is for being at 0.
     """
 
-    split, split_episodes = Dataset.split, Dataset.split_episodes
+    split = Dataset.split
     fit_scaler = Dataset.fit_scaler
     folder = "cart"
 

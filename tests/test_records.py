@@ -13,10 +13,9 @@ from key_table import key_table
 from msgspec import Meta
 
 from jbrep.errors import DamageError, InputError
-from jbrep.records.document import Document, read_document
+from jbrep.records.document import Document, read_document, toml_text
 from jbrep.records.record import Finite, Record, from_plain, from_text, to_plain
 from jbrep.records.storage import publish, unfinished, write_new, write_whole
-from jbrep.records.toml import toml_text
 
 
 class Point(Record, frozen=True, array_like=True):

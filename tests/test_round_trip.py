@@ -14,7 +14,7 @@ from jbrep.methods.fit import Fitter
 from jbrep.rl.controller import export, load_policy
 from jbrep.rl.policy_file import find_shipped as find
 
-EPISODES, STEPS = 30, 150
+EPISODES, STEPS = 16, 150
 TASK = describe("face_direction", max_episode_steps=STEPS)
 NAMED = ("--time", "time", "--episode", "trial", "--task", "face_direction")
 SEEN = "position*,orientation*,velocity*,angular*,motor*,angle*"

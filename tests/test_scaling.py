@@ -106,7 +106,6 @@ def difference(rows, others):
 
 VARIANTS = (
     {},
-    {"keep": ()},
     {"on": "observation", "clip": None},
     {"clip": None, "layers": False},
     {"on": "coordinates", "clip": None, "keep": ("velocity", "motor_angle.sin")},

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from jbrep.jitterbug.bodies import PUBLISHED, draw
-from jbrep.jitterbug.model import PHYSICS_STEPS, plain_model
-from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.simulation import PHYSICS_STEPS, Simulation, plain_model
 from jbrep.jitterbug.tasks import get_task
 
 STEPS = 150
@@ -129,15 +128,6 @@ def test_a_random_body_is_the_episode_s_whatever_its_lane():
         np.testing.assert_array_equal(drive(simulation)[:, lane], tape[:, 4])
 
 
-def test_each_episode_of_a_generator_has_its_own_random_body():
-    random, numbers = np.random.default_rng(3), []
-    simulation = Simulation(get_task("face_direction"), 1, 1, "random")
-    for _ in range(5):
-        simulation.reset([0], [random])
-        numbers.append(simulation.state["body"][0])
-    assert len(set(numbers)) == 5
-
-
 def test_a_random_body_changes_nothing_else_that_is_drawn():
     plain, other = np.random.default_rng(3), np.random.default_rng(3)
     one = Simulation(get_task("move_to_pose"), 1, 1)
@@ -184,14 +174,6 @@ def test_a_state_holds_bodies_only_where_there_are_others():
     simulation.reset([1], [np.random.default_rng(1)])
     assert "body" not in simulation.state
     np.testing.assert_array_equal(drive(simulation)[:, 1], drive(with_bodies([1], None))[:, 0])
-
-
-def test_a_state_without_bodies_leaves_the_lanes_theirs():
-    simulation = with_bodies(range(2), 7)
-    state = simulation.state
-    del state["body"]
-    simulation.restore(**state)
-    np.testing.assert_array_equal(simulation.state["body"], [7, 7])
 
 
 def test_a_lane_s_model_and_data_are_those_of_its_body():

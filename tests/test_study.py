@@ -30,7 +30,7 @@ from jbrep.dataset import Dataset
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.play.sources import find_player, find_untrained
+from jbrep.play.sources import find_player
 from jbrep.report.findings import Findings
 from jbrep.report.report import results_text
 from jbrep.report.tables import read_tables
@@ -524,7 +524,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
 
 
 def test_one_study_at_a_time(done):
-    from jbrep.records.lock import exclusive
+    from jbrep.records.storage import exclusive
 
     with exclusive(done.folder), pytest.raises(InputError, match="is being written by process"):
         run_study(done, on_this_machine, 1)
@@ -562,7 +562,7 @@ def test_a_folder_without_runs_is_refused(tmp_path):
 def test_a_run_is_played_before_and_after_training_with_another_body(done):
     run = done.folder / "runs" / "face_direction" / "a2c" / "full" / "seed-0"
     other = describe("face_direction", {"body": 7}, 100)
-    assert find_untrained(run, other).task == find_player(str(run), other).task == other
+    assert find_player(str(run), other).task == other
 
 
 def test_tasks_may_come_and_go_whichever_was_collected(tmp_path):

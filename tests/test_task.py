@@ -211,11 +211,8 @@ def sledging(monkeypatch):
 def test_a_time_limit_is_the_same_in_each_episode(sledging):
     task = sledging(lasts=[350])
     assert (task.max_episode_steps, task.timestep) == (350, 0.25)
-    differs = "it truncated an episode after {} steps, and another lasted at least {}: give one"
-    for lasts in ([250, 350], [350, 250], [20, 150]):
-        told = refused(partial(sledging, lasts=lasts))
-        assert differs.format(min(lasts), max(lasts)) in told
-    assert "at least 10,000: give one with" in refused(partial(sledging, lost=0.25))
+    for other in ({"lasts": [20, 150]}, {"lasts": [350, 250]}, {"lost": 0.25}):
+        assert "--episode-steps" in refused(partial(sledging, **other))
     assert "AssertionError: the rail broke" in refused(partial(sledging, fails=300))
     assert sledging(250, fails=300).max_episode_steps == 250
     assert "failed when it was tried: AssertionError" in refused(partial(sledging, fails=30))
@@ -234,11 +231,9 @@ def test_observations_must_fit_their_space(sledging):
     assert said in refused(partial(sledging, 9, numbers=3))
 
 
-@pytest.mark.parametrize("steps", [0, 1_000_001])
-def test_a_time_limit_out_of_range_is_refused(steps):
-    for name in ("face_direction", "Pendulum-v1"):
-        told = refused(lambda: describe(name, max_episode_steps=steps))  # noqa: B023
-        assert f"in an episode is {steps}" in told
+@pytest.mark.parametrize("name", ["face_direction", "Pendulum-v1"])
+def test_a_time_limit_out_of_range_is_refused(name):
+    assert "in an episode is 0" in refused(lambda: describe(name, max_episode_steps=0))
 
 
 def test_modules_are_imported_for_a_command_line_only(tmp_path, monkeypatch):

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jbrep.errors import InputError
 from jbrep.jitterbug import tasks
-from jbrep.jitterbug.tasks import TASKS, Readings, get_task
+from jbrep.jitterbug.tasks import TASKS, Readings
 
 SIZES = {
     "move_from_origin": 15,
@@ -48,11 +47,6 @@ def test_the_five_tasks_and_their_sizes():
         assert task.plain.feature_names[:15] == TASKS["move_from_origin"].plain.feature_names
         assert len(set(task.plain.feature_names)) == task.plain.size
         assert task.observe(readings()).shape == (1, task.plain.size)
-
-
-def test_an_unknown_task_is_named_with_the_choices():
-    with pytest.raises(InputError, match=r"unknown task 'fly'.*face_direction.*move_to_pose"):
-        get_task("fly")
 
 
 def test_shared_features_are_states():

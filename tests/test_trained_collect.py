@@ -15,8 +15,8 @@ from jbrep.collect.backends import make_episodes
 from jbrep.collect.derive import derive
 from jbrep.collect.shards import Simulator
 from jbrep.dataset import Dataset
+from jbrep.dataset.manifest import find_problems
 from jbrep.dataset.schema import joined
-from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError

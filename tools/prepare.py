@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from jbrep.records.lock import exclusive
+from jbrep.records.storage import exclusive
 from jbrep.study import Plan, read_study
 from jbrep.study.prepare import check, prepare
 from jbrep.study.runner import usual_workers

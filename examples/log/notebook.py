@@ -16,8 +16,7 @@ from record import record
 
 import jbrep
 from jbrep.dataset import Layout, from_file
-from jbrep.play.exported import exported_player
-from jbrep.play.sources import find_player
+from jbrep.play.sources import exported_player, find_player
 from jbrep.rl.controller import export, load_policy
 from jbrep.rl.policy_file import find_shipped as find
 

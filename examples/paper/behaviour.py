@@ -24,8 +24,9 @@ from jbrep.envs import describe
 from jbrep.envs.task import Task
 from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.player import Player
-from jbrep.play.sources import find_player, find_untrained, is_by_name
+from jbrep.play.sources import as_player, find_player, is_by_name
 from jbrep.rl.files import FINISHED, is_run, read_run, runs_below
+from jbrep.rl.policy import load_untrained
 
 SPEEDS = np.linspace(-180, 180, 73)  # edges of the bins of the motor's velocity [rad/s]
 FAST = 30.0  # of the motor, either way [rad/s]
@@ -56,8 +57,8 @@ def find(sources: Sequence[str], task: Task | None) -> dict[str, list[Player]]:
         if not is_run(folder):  # those that failed have no policy
             runs = [run for run in runs if read_run(run).status == FINISHED]
         after = [find_player(str(run), task) for run in runs]
-        before = [find_untrained(run, p.task) for run, p in zip(runs, after, strict=True)]
-        found[f"{name}, before training"] = before
+        before = f"{name}, before training"
+        found[before] = [as_player(before, load_untrained(run), task) for run in runs]
         found[f"{name}, {len(runs)} runs" if len(runs) > 1 else name] = after
     return found
 

@@ -91,7 +91,7 @@ def verify(
     """
     from jbrep.collect.replay import replay_problems
     from jbrep.dataset import Dataset
-    from jbrep.dataset.verify import find_problems
+    from jbrep.dataset.manifest import find_problems
 
     if _say_all(find_problems(data)):
         return True
@@ -119,7 +119,7 @@ def _say_all(lines: Iterable[str]) -> bool:
 @command("data repair data/face")
 def repair(data: Path, /, *, lanes: Lanes = 100, threads: Threads = None) -> None:
     """Make damaged and missing shards again from their seeds."""
-    from jbrep.collect.repair import repair as run
+    from jbrep.collect.replay import repair as run
     from jbrep.play.sources import kept_policy
 
     with stoppable(RESUMES):
@@ -243,8 +243,8 @@ def import_data(
 
 def _layout(path: Path | None, given: dict[str, Any]) -> Layout:
     """What the columns are by a file, and by options before it."""
+    from jbrep.records.document import read_toml
     from jbrep.records.record import from_plain, to_plain
-    from jbrep.records.toml import read_toml
 
     told = read_toml(path) if path else {}
     try:

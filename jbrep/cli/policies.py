@@ -132,8 +132,7 @@ def check(
     """
     import numpy as np
 
-    from jbrep.play.exported import exported_player
-    from jbrep.play.sources import find_player
+    from jbrep.play.sources import exported_player, find_player
 
     beside = find_player(run, task) if run else None
     player = exported_player(model, beside.task if beside else task)

@@ -43,8 +43,6 @@ def _rl(
     if told := shares_text(last_infos(read_infos(out), read_evaluations(out))):
         tell(told)
     with stoppable("the run itself is finished"):
-        from jbrep.study.single import beside
-
         alone = is_one_robot(task, options.get("threads"))
         if not alone and (compared := beside(task, returns, min(len(returns), _BESIDE))):
             tell(str(compared))

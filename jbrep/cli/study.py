@@ -43,8 +43,8 @@ def study(
         register: write down the plan beside STUDY, with the hashes of what is there and the code's
             version, before the first run.
     """
+    from jbrep.records.document import read_toml
     from jbrep.records.storage import exists
-    from jbrep.records.toml import read_toml
 
     if dry_run and register:
         raise InputError("--dry-run and --register exclude each other: choose one")

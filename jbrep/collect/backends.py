@@ -14,8 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from jbrep.collect.shards import Growth, Produce, Simulator
 from jbrep.dataset.schema import Columns
-from jbrep.envs.instances import close_kept
-from jbrep.envs.make import is_batched
+from jbrep.envs.make import close_kept, is_batched
 from jbrep.envs.names import import_modules, imported_modules, spec_of
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, first_line

@@ -26,8 +26,7 @@ from jbrep.envs.lanes import check_counts
 from jbrep.envs.make import is_batched
 from jbrep.errors import DamageError, InputError, choose, differences
 from jbrep.progress import Progress
-from jbrep.records.lock import exclusive
-from jbrep.records.storage import check_space, exists, make_folder, write_whole
+from jbrep.records.storage import check_space, exclusive, exists, make_folder, write_whole
 from jbrep.text import counted
 
 _BATCH_ROWS = 100_000  # of a shard that a batch makes
@@ -104,7 +103,6 @@ def write_shards(
 
 
 def _fill(growth: Growth, produce: Produce, name: str) -> Manifest:
-    """Make episodes until the data set is complete."""
     begun, total = growth.rows, growth.manifest.settings.steps
     options: dict[str, Any] = {"unit": "step", "unit_scale": True, "desc": name}
     with Progress(total=total, initial=begun, **options) as progress:

@@ -13,10 +13,9 @@ from jbrep.collect.policies import acts_on_observations
 from jbrep.collect.replay import replay_problems
 from jbrep.collect.shards import Growth, Produce
 from jbrep.dataset import Dataset, DataSettings
-from jbrep.dataset.manifest import Manifest, new_manifest, open_shard, shard_image
+from jbrep.dataset.manifest import Manifest, new_manifest, open_shard, policy_files, shard_image
 from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns, some_episodes
-from jbrep.dataset.verify import policy_files
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.recording import Tick
 from jbrep.envs.task import Task
@@ -39,14 +38,8 @@ def derive(
 ) -> Manifest:
     """Write the data set that collecting another task with the same settings gives, bit for bit.
 
-    Actions that don't depend on observations lead to the same states in every task.
-
-    Args:
-        source: a finished data set with stored states.
-        task_name: the task to observe and reward.
-        folder: where to write; an unfinished derivation is resumed.
-        store_state: whether to store the states as well.
-        num_threads: to use; None takes one for each core.
+    Actions that don't depend on observations lead to the same states in every task. The source is
+    finished and has its states; an unfinished derivation is resumed.
     """
     dataset = _finished(source)
     settings, before = dataset.manifest.settings, dataset.task
@@ -84,15 +77,10 @@ def derive_view(
     history: int = 1,
     reward: str = "",
 ) -> Manifest:
-    """Write the data set with less or more to see, or with other rewards.
+    """Write a data set of any robot with less or more to see, or with other rewards.
 
-    Args:
-        source: a finished data set, of any robot.
-        folder: where to write; an unfinished derivation is resumed.
-        hidden: as `with_view` takes it.
-        history: likewise.
-        reward: as `reward_function` takes it, for rewards of what the source shows; its own if
-            empty.
+    What is hidden, and the history, are as `with_view` takes them; the reward, as `reward_function`
+    does, is of what the source shows. An unfinished derivation is resumed.
     """
     dataset = _finished(source)
     settings = dataset.manifest.settings
@@ -137,7 +125,6 @@ def _check_derived(
 
 
 def _rewarded(code: str) -> Callable[[Columns], Columns]:
-    """Gives columns the rewards of a user's, episode by episode."""
     rewards = reward_function(code)
 
     def change(columns: Columns) -> Columns:
@@ -150,7 +137,6 @@ def _rewarded(code: str) -> Callable[[Columns], Columns]:
 
 
 def _seen(task: Task) -> Callable[[Columns], Columns]:
-    """Shows of columns what a task's view does."""
     final = EPISODES + "final_observation"
     given = "observation", "action", final, EPISODES + "length"
 
@@ -181,8 +167,6 @@ def _is_of_earlier(dataset: Dataset, settings: DataSettings) -> bool:
 
 
 def _each_shard(dataset: Dataset, change: Callable[[Columns], Columns]) -> Produce:
-    """Makes the shards of a data set from those of another."""
-
     def produce(growth: Growth, tick: Tick) -> Iterator[Columns]:
         manifest, each = dataset.manifest, dataset.manifest.settings.shard_episodes
         for shard in range(growth.episodes // each, len(manifest.shards)):
@@ -196,8 +180,6 @@ def _each_shard(dataset: Dataset, change: Callable[[Columns], Columns]) -> Produ
 def _observed(
     task: JitterbugTask, settings: DataSettings, num_threads: int | None
 ) -> Callable[[Columns], Columns]:
-    """Shows columns as another task observes and rewards them."""
-
     def change(columns: Columns) -> Columns:
         own = episode_columns(columns)
         length = own["length"]

@@ -152,7 +152,6 @@ class Heuristic(Constants, frozen=True):
 
 
 def _one_by_one(blocks: Iterator[NDArray[Any]]) -> Actor:
-    """The actor that plays blocks of actions (steps, n, k), one step after the other."""
     return open_loop(action for block in blocks for action in block)
 
 
@@ -195,9 +194,7 @@ _WEIGHT = re.compile(r":([\d.]+(?:e-?\d+)?)\+")  # between the parts of a mixtur
 def parse_policy(text: str, other: Callable[[str], Policy | None] = lambda text: None) -> Policy:
     """Make a policy from text such as `constant:drive=0.5` or `uniform:0.8+heuristic:0.2`.
 
-    Args:
-        text: a policy, or parts of a mixture with their weights.
-        other: the policy that text stands for which is none of POLICIES; None if there is none.
+    For text that is none of POLICIES, `other` gives the policy, if it knows one.
     """
     if policy := other(text):
         return policy
@@ -235,22 +232,11 @@ def acts_on_observations(settings: Mapping[str, Any]) -> bool:
     return not all(kind in POLICIES and POLICIES[kind].open_loop for kind in kinds)
 
 
-def _unreadable(settings: Mapping[str, Any]) -> Policy:
-    raise InputError(
-        f"a {settings['kind']} policy is more than its settings: give the one in its file"
-    )
-
-
 def make_policy(
-    settings: Mapping[str, Any], trained: Callable[[Mapping[str, Any]], Policy] = _unreadable
+    settings: Mapping[str, Any], trained: Callable[[Mapping[str, Any]], Policy] | None = None
 ) -> Policy:
-    """Make a policy from its settings, as in a manifest.
-
-    Args:
-        settings: its kind and constants.
-        trained: makes those of runs, which need more than their settings.
-    """
-    if settings["kind"] == TRAINED:
+    """Make a policy from its settings, as in a manifest; those of runs need more than these."""
+    if trained and settings["kind"] == TRAINED:
         return trained(settings)
     if settings["kind"] == MIXTURE:
         return Mixture(tuple((w, make_policy(part, trained)) for w, part in settings["parts"]))

@@ -127,7 +127,6 @@ class Simulator:
                 retries.failed(error)
 
     def _simulate(self, episodes: Array, lanes: Lanes, tick: Tick) -> Columns:
-        """The columns of some episodes, one in each lane."""
         task = self.settings.task
         seeds = self.settings.seeds(episodes)
         lanes.reset(range(lanes.num_lanes), seeds.tolist())
@@ -141,7 +140,6 @@ class Simulator:
         return self._columns(recording, episodes, seeds)
 
     def _columns(self, recording: Recording, episodes: Array, seeds: Array) -> Columns:
-        """The columns of what was recorded, one episode after the other."""
         task, length, lanes = self.settings.task, recording.length, np.arange(len(episodes))
         seen: dict[str, Array] = {"observation": recording.observation, **recording.arrays}
         steps: dict[str, Array] = {"action": recording.action, "reward": recording.reward, **seen}

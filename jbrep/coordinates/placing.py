@@ -1,11 +1,11 @@
-"""Moving robots in the world: what symmetry leaves out, put back from somewhere else."""
+"""The same robots elsewhere in the world, and the same states in other numbers."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.coordinates.coordinates import in_range
+from jbrep.coordinates.coordinates import in_range, wrapped
 from jbrep.coordinates.made import attitude_of, units
 from jbrep.envs.task import Task
 
@@ -50,3 +50,33 @@ def _heading(task: Task, rows: NDArray[Any]) -> NDArray[np.complex128]:
     half = columns[0] + 1j * columns[3]
     size = np.abs(half)
     return np.where(size > 0, half / np.where(size > 0, size, 1), 1) ** 2
+
+
+def nearest(task: Task, rows: NDArray[Any], like: NDArray[Any]) -> NDArray[Any]:
+    """Observations in the numbers that are nearest to those of others, (n, d)."""
+    found = rows.copy()
+    for place, unit in units(task):
+        of, other = rows[:, place], like[:, place]
+        if unit[0].kind == "quaternion":
+            found[:, place] = of * _sign(of, other)
+        elif unit[0].is_angle:
+            found[:, place] = other + wrapped(of - other)
+    return found
+
+
+def continuous(task: Task, rows: NDArray[Any]) -> NDArray[Any]:
+    """Observations (n, d) along a path in numbers that don't jump."""
+    found = rows.copy()
+    for place, unit in units(task):
+        of = rows[:, place]
+        if unit[0].kind == "quaternion":
+            found[1:, place] = of[1:] * np.cumprod(_sign(of[1:], of[:-1]), axis=0)
+        elif unit[0].is_angle:
+            found[:, place] = np.unwrap(of, axis=0)
+    return found
+
+
+def _sign(quaternions: NDArray[Any], others: NDArray[Any]) -> NDArray[Any]:
+    """-1 where a quaternion is nearer to another with the other sign, else 1, (n, 1)."""
+    along = (quaternions * others).sum(axis=1, keepdims=True)
+    return np.where(along < 0, -1, 1).astype(quaternions.dtype)

@@ -6,9 +6,9 @@ from jbrep.lazy import exports
 
 if TYPE_CHECKING:
     from jbrep.dataset.columns import Column as Column
-    from jbrep.dataset.imports import from_arrays as from_arrays
-    from jbrep.dataset.imports import from_file as from_file
-    from jbrep.dataset.imports import from_table as from_table
+    from jbrep.dataset.formats.writer import from_arrays as from_arrays
+    from jbrep.dataset.formats.writer import from_file as from_file
+    from jbrep.dataset.formats.writer import from_table as from_table
     from jbrep.dataset.layout import Layout as Layout
     from jbrep.dataset.reader import Dataset as Dataset
     from jbrep.dataset.reader import Episode as Episode

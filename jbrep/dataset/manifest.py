@@ -7,7 +7,8 @@ where each column begins.
 import hashlib
 import json
 import mmap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -16,8 +17,10 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings
+from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, refusing
+from jbrep.progress import Progress
 from jbrep.records.commit import Commits, commits
 from jbrep.records.document import Document, document_from, parse_json
 from jbrep.records.record import Record, Sha256, Version
@@ -109,10 +112,7 @@ def _digest(plain: Mapping[str, Any]) -> str:
 def new_manifest(settings: DataSettings, source: Manifest | None = None) -> Manifest:
     """A manifest without shards, of the installed versions of jbrep's and the environment's.
 
-    Args:
-        settings: of the data set.
-        source: of the data that it is derived from, which know the versions of the environment:
-            that need not be here then.
+    Data derived from a source have the environment's versions from there: it need not be here.
     """
     from importlib.metadata import version  # slow to import, and readers don't need it
 
@@ -127,11 +127,7 @@ def new_manifest(settings: DataSettings, source: Manifest | None = None) -> Mani
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a data set.
-
-    Raises:
-        DamageError: it isn't what jbrep wrote.
-    """
+    """The manifest of a data set."""
     path = folder / MANIFEST
     if not exists(path):
         raise InputError(
@@ -158,11 +154,7 @@ def shard_path(folder: Path, shard: int) -> Path:
 
 
 def check_sizes(folder: Path, manifest: Manifest) -> None:
-    """Make sure that all shards are there, by their sizes.
-
-    Raises:
-        DamageError: one is missing, or has another size.
-    """
+    """Make sure that all shards are there, by their sizes."""
     for shard, entry in enumerate(manifest.shards):
         _check_size(shard_path(folder, shard), entry)
 
@@ -177,16 +169,9 @@ def _check_size(path: Path, entry: Entry) -> None:
 
 
 def open_shard(folder: Path, manifest: Manifest, shard: int, *, known: bool = False) -> Columns:
-    """The columns of a shard, as read-only views of its file.
+    """The columns of a shard, as read-only views of its file, unless that is damaged.
 
-    Args:
-        folder: of the data set.
-        manifest: that lists the shard.
-        shard: its number.
-        known: whether its hash has been checked before; its size always is.
-
-    Raises:
-        DamageError: its bytes aren't those that were written, or the file is missing.
+    Its size is always checked, its hash unless it is `known` to be right.
     """
     path, entry = shard_path(folder, shard), manifest.shards[shard]
     _check_size(path, entry)
@@ -218,13 +203,7 @@ def shard_image(manifest: Manifest, shard: int, columns: Columns) -> tuple[Entry
 
 
 def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
-    """Write the next shard, then the manifest that lists it, which is returned.
-
-    Args:
-        folder: of the data set.
-        manifest: of the shards before it.
-        columns: of its episodes.
-    """
+    """Write the next shard, then the manifest that lists it, which is returned."""
     path = shard_path(folder, len(manifest.shards))
     if exists(path):  # the last shard, with fewer episodes: from now on it doesn't count
         write_manifest(folder, manifest)
@@ -233,3 +212,61 @@ def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
     manifest = manifest.replace(shards=(*manifest.shards, entry))
     write_manifest(folder, manifest)
     return manifest
+
+
+def find_problems(folder: Path) -> Iterator[str]:
+    """A line for each file of a data set that is damaged or missing, or has what can't be."""
+    try:
+        manifest = read_manifest(folder)
+    except DamageError as damage:
+        yield str(damage)
+        return
+    try:
+        policy_files(folder, manifest)
+    except DamageError as damage:
+        yield str(damage)
+    for shard in Progress(range(len(manifest.shards)), unit="shard", desc="verify", leave=False):
+        try:
+            columns = open_shard(folder, manifest, shard)
+        except DamageError as damage:
+            yield str(damage)
+        else:
+            for problem in range_problems(manifest.task, columns):
+                yield f"{shard_path(folder, shard)}: {problem}"
+
+
+def policy_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:
+    """The files of the trained policies that acted in a data set, by name, as they were then."""
+    files = dict[str, bytes]()
+    for policy in (each for each in parts_of(manifest.settings.policy) if each["kind"] == TRAINED):
+        path, raw = folder / Path(policy["file"]).name, b""
+        with suppress(OSError):
+            raw = path.read_bytes()
+        if hashlib.sha256(raw).hexdigest() != policy["sha256"]:
+            raise DamageError(
+                f"{path} is damaged or missing: it is the policy of {policy['run']} at step "
+                f"{policy['step']:,}, which only a copy can restore"
+            )
+        files[path.name] = raw
+    return files
+
+
+def range_problems(task: Task, columns: Columns) -> Iterator[str]:
+    """A line for each action, reward or feature beyond the task's bounds."""
+    names = [f"action {i}" for i in range(task.action_size)]
+    bounds = zip(names, columns["action"].T, task.action_low, task.action_high, strict=True)
+    ranges: list[tuple[str, NDArray[np.float32], float, float]] = list(bounds)
+    if "reward" in columns:
+        low = -np.inf if task.reward_low is None else min(task.reward_low, 0)
+        high = np.inf if task.reward_high is None else max(task.reward_high, 0)
+        ranges.append(("reward", columns["reward"], low, high))
+    for values in (columns["observation"], columns[EPISODES + "final_observation"]):
+        ranges += [
+            (feature.name, values[:, i], feature.low, feature.high)
+            for i, feature in enumerate(task.features)
+            if feature.bounded and feature.low is not None and feature.high is not None
+        ]
+    for name, values, low, high in ranges:
+        if len(values) and not np.float32(low) <= values.min() <= values.max() <= np.float32(high):
+            extent = f"ranges from {values.min():g} to {values.max():g}"
+            yield f"{name} {extent}, beyond [{low:g}, {high:g}]"

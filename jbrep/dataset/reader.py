@@ -72,9 +72,7 @@ class Dataset:
         manifest: settings, versions and hashes.
         task: the task whose features the observations hold.
 
-    Raises:
-        DamageError: a file is damaged or missing; also later, when rows of a damaged shard are
-            read.
+    A DamageError says that a file is damaged or missing, also later, when its rows are read.
     """
 
     def __init__(self, folder: str | Path):
@@ -178,25 +176,19 @@ class Dataset:
             test: share of the episodes to hold out, in (0, 1); at least one is held out.
             seed: of the draw.
         """
-        lengths = self.episodes["length"]
-        held_out = np.zeros(len(lengths), dtype=bool)
-        held_out[self.split_episodes(test, seed).test] = True
-        is_test = np.repeat(held_out, lengths)
-        return Split(np.flatnonzero(~is_test), np.flatnonzero(is_test))
-
-    def split_episodes(self, test: float = 0.2, seed: int = 0) -> Split:
-        """The same split as `split`, by the numbers of the episodes, sorted."""
         if not 0 < test < 1:
             raise InputError(f"the share to hold out is {test}: it must be between 0 and 1")
-        number = len(self.episodes["length"])
+        lengths = self.episodes["length"]
+        number = len(lengths)
         if number < 2:
             raise InputError(
                 f"a split needs at least 2 episodes: {self.folder} has {number}; "
                 "collect more, or cut what is imported into several"
             )
         count = min(max(1, round(test * number)), number - 1)
-        order = np.random.default_rng(seed).permutation(number)
-        return Split(np.sort(order[count:]), np.sort(order[:count]))
+        held_out = np.isin(range(number), np.random.default_rng(seed).permutation(number)[:count])
+        is_test = np.repeat(held_out, lengths)
+        return Split(np.flatnonzero(~is_test), np.flatnonzero(is_test))
 
     def fit_scaler(self, rows: NDArray[np.int64]) -> Scaler:
         """The scaling of observations to [-1, 1] over some rows, such as the training part."""
@@ -229,7 +221,6 @@ class Dataset:
         }
 
     def _ranges(self) -> list[dict[str, Any]]:
-        """Unit, extrema, mean and standard deviation of each feature, and its usual range."""
         column = self["observation"]
         (low, high), (mean, std) = extrema(column.chunks()), mean_and_std(column.chunks())
         found = zip(self.task.features, low, mean, high, std, strict=True)
@@ -251,7 +242,6 @@ class Dataset:
         return html(Table(str(self.folder), ("", ""), [*named.items()]), table)
 
     def _card(self) -> tuple[dict[str, str], Table]:
-        """What is known of the whole, and of each feature."""
         about, rows = self.describe(), []
         for each in about.pop("features"):
             low, high = each["nominal"]
@@ -286,7 +276,6 @@ class Dataset:
 
 
 def _spread_text(values: Mapping[str, float]) -> str:
-    """What `_spread` found, in a line."""
     shown = {name: number(value, ",.1f") for name, value in values.items()}
     return (
         f"median {shown['median']} [10 % {shown['p10']}, 90 % {shown['p90']}], mean "

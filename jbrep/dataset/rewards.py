@@ -16,10 +16,9 @@ Array = NDArray[Any]
 
 
 def reward_function(code: str) -> Callable[[Array, Array], NDArray[np.float64]]:
-    """A function of observations (n, d) and actions (n, k), for an episode's rewards (n,).
+    """A user's function of observations (n, d) and actions (n, k), for an episode's rewards (n,).
 
-    Args:
-        code: module:function, the module of which has been imported on request.
+    It is named as module:function, and sees what the data set has, without offsets of features.
     """
     function = code_named(code, "reward")
 

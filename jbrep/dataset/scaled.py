@@ -65,13 +65,9 @@ class ScaledDataset:
         clip: float | None = None,
         without: Collection[str] = (),
     ) -> "ScaledDataset":
-        """The same rows and split, scaled otherwise.
+        """The same rows and split, scaled otherwise, see `fit_scaler`.
 
-        Args:
-            scaling: as `fit_scaler` takes it.
-            coordinates: likewise.
-            clip: likewise.
-            without: features or coordinates that rows don't have, or groups of such coordinates.
+        Rows then are without some features or coordinates, or groups of such coordinates.
         """
         other = copy(self)
         for found in ("moments", "constant_features"):

@@ -103,16 +103,7 @@ def fit_scaler(
     coordinates: Coordinates | None = None,
     clip: float | None = None,
 ) -> Scaler:
-    """A scaling of observations, or of their coordinates.
-
-    Args:
-        scaling: a key of SCALINGS.
-        task: of the observations.
-        column: of observations (N, d).
-        rows: that it is fitted to.
-        coordinates: as in `Scaler`.
-        clip: likewise.
-    """
+    """A scaling, a key of SCALINGS, of observations or their coordinates, fitted to some rows."""
     features = coordinates.features if coordinates else task.features
 
     def parts(rows: Rows) -> Iterator[NDArray[Any]]:

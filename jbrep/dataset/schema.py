@@ -138,11 +138,7 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
         return {n: spec for n, spec in self.specs().items() if not n.startswith(EPISODES)}
 
     def columns(self, known: Columns) -> Columns:
-        """All columns of some episodes, in order.
-
-        Args:
-            known: those at least that don't follow from others; of any type that fits the column's.
-        """
+        """All columns of some episodes, in order, from those that follow from no others."""
         return {
             name: np.asarray(spec.follows(known) if spec.follows else known[name], spec.dtype)
             for name, spec in self.specs().items()

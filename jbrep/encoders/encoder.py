@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, Union
 import numpy as np
 
 from jbrep.coordinates import Coordinates, is_torch, library_of
-from jbrep.coordinates.nearest import nearest
+from jbrep.coordinates.placing import nearest
 from jbrep.dataset import Scaler
 from jbrep.encoders.base import BaseEncoder, Float32, OwnEncoder
 from jbrep.encoders.header import HELD_OUT_MSE, IMPORTED, EncoderHeader

@@ -21,12 +21,6 @@ class AutoresetStep(NamedTuple):
     ended: Flags  # (n,)
     terminated: Flags  # (n,) whether a state ended it
     non_finite: Flags | None  # (n,) whether the physics diverged, where the environment says so
-    lost: Flags  # (n,) whether it led to nothing, as the environment failed at once
-
-    @property
-    def diverged(self) -> Flags:
-        """Whether the physics is known to have diverged, (n,)."""
-        return np.zeros_like(self.ended) if self.non_finite is None else self.non_finite
 
     def told(self, lane: int) -> dict[str, Any]:
         """What there is to say of the end of a lane's episode, some of it by its environment."""
@@ -85,19 +79,15 @@ class AutoresetLanes:
 
     def step(self, actions: Array) -> AutoresetStep:
         """Hold an action in every lane for its steps; actions (n, k)."""
-        before = self.lanes.steps
         self._taken.append(actions)
         step, reward, non_finite = self._hold(actions)
-        lost = self.lanes.steps == before
         ended, observation, length = ~self.lanes.active, step.observation, self.lanes.steps
         if ended.any():
             numbers = np.flatnonzero(ended).tolist()
             self._episodes[numbers] += 1
             observation = self._start(numbers)
         final, terminated = step.observation, step.terminated
-        return AutoresetStep(
-            observation, final, reward, length, ended, terminated, non_finite, lost
-        )
+        return AutoresetStep(observation, final, reward, length, ended, terminated, non_finite)
 
     def _hold(self, actions: Array) -> tuple[Step, Array, Flags | None]:
         """The last step, the sum of rewards, and whether the physics diverged in any."""

@@ -10,18 +10,17 @@ from typing import Any
 import numpy as np
 from msgspec.structs import asdict
 
-from jbrep.envs import instances
 from jbrep.envs.domain import PHYSICS, SIGNALS, Domain, read_ranges
 from jbrep.envs.lanes import Lanes
-from jbrep.envs.make import aside, creator, is_batched
+from jbrep.envs.make import aside, creator, give_back, is_batched, take
 from jbrep.envs.names import absolute, code_of, files_of, find_spec, spec_of
 from jbrep.envs.physics import can_be_pushed, physics_of
 from jbrep.envs.probe import Signals, precision_problems, probe
 from jbrep.envs.task import EpisodeSteps, Feature, Frame, Kind, Task, Word
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError, Notice, refusing
+from jbrep.records.document import read_toml
 from jbrep.records.record import Finite, Record, converted, from_plain, to_plain
-from jbrep.records.toml import read_toml
 from jbrep.text import counted, facts, table
 
 _SPREAD_EPISODES = 5  # of random actions
@@ -157,7 +156,6 @@ def with_features(task: Task, path: Path) -> Task:
 
 
 def _said(changes: Record) -> dict[str, Any]:
-    """The fields that a record has."""
     return {name: value for name, value in asdict(changes).items() if value is not None}
 
 
@@ -183,11 +181,11 @@ def changeable(task: Task) -> tuple[str, ...]:
     if is_batched(task):
         own = getattr(creator(spec_of(task), vector=True), "changeable", ())
         return (*SIGNALS, *own)
-    env = instances.take(task.id, task.arguments, task.max_episode_steps)
+    env = take(task.id, task.arguments, task.max_episode_steps)
     physics = physics_of(env)
     can_push = physics and can_be_pushed(physics.model)
     own = [name for name in PHYSICS if name != "push" or can_push] if physics else []
-    instances.give_back(env)
+    give_back(env)
     return (*SIGNALS, *own)
 
 

@@ -17,15 +17,11 @@ _OPTIONS = ("friction", "mass", "body")  # of a batch that has them, when it is 
 
 
 class Disturbed:
-    """A batch of environments as a task's domain has it.
+    """A batch of environments, as `Lanes` steps one, as a task's domain has it.
 
-    What an episode draws follows from its seed, and what a step draws from its number, too.
-
-    Args:
-        batch: as `Lanes` steps one; what of the physics is drawn, it does itself, or else takes it
-            as options of `reset` and in `push`.
-        task: with a domain.
-        num_lanes: n.
+    What an episode draws follows from its seed, and what a step draws from its number, too. What of
+    the physics is drawn, the batch does itself, or else takes it as options of `reset` and in
+    `push`.
     """
 
     def __init__(self, batch: Any, task: Task, num_lanes: int):
@@ -105,10 +101,6 @@ class Varied(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment with MuJoCo, whose friction, masses and pushes each episode draws.
 
     Frictions and masses that the environment itself sets in its reset are multiplied likewise.
-
-    Args:
-        env: the environment.
-        domain: from which it draws.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], domain: Domain):

@@ -128,9 +128,7 @@ def read_ranges(given: Mapping[str, Any]) -> dict[str, Any]:
 class Draws:
     """Random numbers of n lanes' episodes: those of a step follow from its number and the seed.
 
-    Args:
-        num_lanes: n.
-        size: d, of what is normally distributed.
+    Of each step they are normal ones, (n, d), and uniform ones.
     """
 
     def __init__(self, num_lanes: int, size: int):
@@ -169,10 +167,9 @@ class Draws:
         return self._now(self._uniform)[:, 0]
 
     def pushes(self, speeds: Array) -> Array:
-        """The velocities that pushes of now would give, (n, 3); zeros where there is none.
+        """The velocities of the pushes of now, zeros where there is none, (n, 3) [m/s].
 
-        Args:
-            speeds: of each lane's pushes, (n,) [m/s].
+        Each lane's pushes have its speed, (n,).
         """
         _, chance, turn = self._now(self._uniform).T
         pushed = np.where(chance < _PUSHES, speeds, 0)

@@ -34,8 +34,7 @@ _imported: list[str] = []
 def find_spec(name: str) -> EnvSpec:
     """What is registered under a short name or an id.
 
-    Raises:
-        ModuleNotFoundError: the package that registers the id isn't installed.
+    ModuleNotFoundError says that the package that registers the id isn't installed.
     """
     if ":" in name:
         raise InputError(
@@ -114,12 +113,7 @@ def import_code(name: object) -> None:
 
 
 def code_named(name: str, what: str) -> Any:
-    """What code names, as in mymodule:MyEncoder.
-
-    Args:
-        name: of it.
-        what: it is, for messages.
-    """
+    """What a name of code stands for, as in mymodule:MyEncoder; messages call it `what`."""
     module, _, path = name.partition(":")
     thing = imported(module)
     if thing is None:

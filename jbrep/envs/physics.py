@@ -78,13 +78,11 @@ def planar_root(model: mujoco.MjModel) -> tuple[int, int, int] | None:
 
 
 def quarter_turn(env: gymnasium.Env[Any, Any], shift: tuple[float, float]) -> bool:
-    """Turn a robot by a quarter about the world's vertical axis, then shift it [m].
+    """Turn a robot by a quarter about the world's vertical axis, then shift it [m], if it can be.
 
-    An environment whose targets move with the robot has a method of that name. A quarter, since
-    MuJoCo's pyramidal friction cones are the same along both axes only.
-
-    Returns:
-        Whether it could be done: only where one body is free, or one moves in the plane.
+    An environment whose targets move with the robot has a method of that name; in others one body
+    must be free, or move in the plane. A quarter, since MuJoCo's pyramidal friction cones are the
+    same along both axes only.
     """
     if own := getattr(env.unwrapped, "quarter_turn", None):
         own(shift)
@@ -128,14 +126,9 @@ def turned_quaternion(quaternions: Array) -> Array:
 def put_factors(
     model: mujoco.MjModel, usual: mujoco.MjModel, friction: float, mass: float, data: mujoco.MjData
 ) -> None:
-    """Give a model the friction and the masses of another one of the same robot, times factors.
+    """Give a model the friction and the masses of the usual one of the same robot, times factors.
 
-    Args:
-        model: to change.
-        usual: where the factors are 1.
-        friction: the factor of all contacts.
-        mass: that of all bodies, with their inertias.
-        data: of a model of the same sizes, whose contents are lost.
+    The contents of `data`, of a model of the same sizes, are lost.
     """
     for names, factor in ((FRICTIONS, friction), (MASSES, mass)):
         for name in names:
@@ -146,14 +139,10 @@ def put_factors(
 def velocity_after(
     model: mujoco.MjModel, qpos: Array, push: NDArray[Any], data: mujoco.MjData
 ) -> Array:
-    """What a push adds to the velocities of a robot's joints at once, (nv,).
+    """What a push adds to the velocities of a robot's joints at once, (nv,); `data` is lost.
 
-    Args:
-        model: of the robot.
-        qpos: where it is, (nq,).
-        push: on the centre of mass of the body that carries all others that move, (3,): the
-            impulse by the mass of these [m/s].
-        data: as for `put_factors`.
+    The push is the impulse on the centre of mass of the body that carries all others that move, by
+    the mass of these, (3,) [m/s].
     """
     can_move = (model.body_rootid == root_of(model)) & (model.body_weldid > 0)
     first = int(np.argmax(can_move * model.body_subtreemass))

@@ -1,20 +1,18 @@
 """What an environment shows when it is played: its task, as far as that can be seen."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
-import gymnasium
 import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim, flatten_space
 from numpy.typing import NDArray
 
-from jbrep.envs import instances
 from jbrep.envs.infos import number_of
-from jbrep.envs.make import action_in, flattener, number, of_size
+from jbrep.envs.make import Env, action_in, discard, flattener, give_back, number, of_size, take
 from jbrep.envs.names import find_spec
 from jbrep.envs.physics import physics_of, planar_root, robot_joint
 from jbrep.envs.task import (
@@ -32,8 +30,6 @@ from jbrep.envs.task import (
 from jbrep.errors import InputError
 from jbrep.text import words
 
-Env = gymnasium.Env[Any, Any]
-
 _STEPS = 200  # of each episode that is compared
 _LONGEST = 10_000  # steps in search of a time limit
 
@@ -42,20 +38,20 @@ _SAME = 1e-6  # relative difference, of observations in float32
 _TURN = 2 * np.pi + 1e-3  # [rad], as models round it
 
 _LARGE = 1000.0  # below it, 32 bits hold each number to .00006
-_CHANGES = 10  # spacings of numbers of 32 bits that a typical change should have
+_LEVELS = 4096  # that 32 bits should have of what a feature goes through
 
 
 def probe(
     env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None
 ) -> "tuple[Task, Signals]":
     """The task of an environment, and what its features went through."""
-    env = instances.take(env_id, arguments, max_episode_steps)
+    env = take(env_id, arguments, max_episode_steps)
     try:
         found = _task_of(env, env_id, arguments, max_episode_steps)
     except BaseException:
-        instances.discard(env)
+        discard(env)
         raise
-    instances.give_back(env)
+    give_back(env)
     return found
 
 
@@ -75,7 +71,7 @@ def _task_of(
         features=_with_kinds(env, features),
         action_low=tuple(low.tolist()),
         action_high=tuple(high.tolist()),
-        max_episode_steps=limit or _find_limit(env, env_id, episodes),
+        max_episode_steps=limit or _find_limit(env, env_id),
         arguments=dict(arguments),
         timestep=timestep if timestep and timestep > 0 else None,
         solved_return=spec.reward_threshold,
@@ -83,14 +79,10 @@ def _task_of(
         reproducible=_content(episodes[0]) == _content(episodes[2]),
         seed_bits=_seed_bits(env),
     )
-    return task, Signals.of(
-        [np.array([each.observation for each in steps], float) for steps in episodes]
-    )
+    return task, Signals.of(np.array([each.observation for steps in episodes for each in steps]))
 
 
 class _Step(NamedTuple):
-    """What an environment gives."""
-
     observation: NDArray[Any]  # flat, (d,)
     reward: float
     terminated: bool
@@ -116,29 +108,16 @@ def _play(env: Env, seed: int, most: int, still: bool = False) -> Iterator[_Step
 
 
 def _content(steps: Sequence[_Step]) -> list[bytes]:
-    """Every bit of each state."""
     return [flat.tobytes() + np.array(told).tobytes() for flat, *told in steps]
 
 
-def _find_limit(env: Env, env_id: str, known: Iterable[Sequence[_Step]]) -> int:
-    """The time limit that an environment keeps by itself, as several episodes show it."""
-    lengths = [(len(steps) - 1, steps[-1].truncated) for steps in known]
-    cut = list[int]()
-    for seed in range(2, 8):
-        still = seed % 2 == 0  # it may last longer
-        steps = [*_play(env, seed, _LONGEST, still)]
-        lengths.append((len(steps) - 1, steps[-1].truncated))
-        cut = [length for length, truncated in lengths if truncated]
-        if cut and not still:
-            break
-    if not cut:
+def _find_limit(env: Env, env_id: str) -> int:
+    """The time limit that an environment keeps by itself, as a still and a random episode show."""
+    played = [[*_play(env, seed, _LONGEST, still=seed == 2)] for seed in (2, 3)]
+    cut = {len(steps) - 1 for steps in played if steps[-1].truncated}
+    if len(cut) != 1 or max(map(len, played)) - 1 > min(cut):
         raise InputError(f"{env_id} has no time limit: give one with --episode-steps")
-    if (longest := max(lengths)[0]) > min(cut):
-        raise InputError(
-            f"{env_id} has no time limit: it truncated an episode after {min(cut):,} steps, and "
-            f"another lasted at least {longest:,}: give one with --episode-steps"
-        )
-    return min(cut)
+    return cut.pop()
 
 
 def _seed_bits(env: Env) -> SeedBits:
@@ -341,51 +320,32 @@ def _whole(found: Sequence[_Quantity | None]) -> int:
 
 
 class Signals(NamedTuple):
-    """What the features of a task went through, (d,) each."""
+    """Least and greatest values of a task's features, (d,) each."""
 
     low: Array
     high: Array
-    change: Array  # from a step to the next, the root of the mean square; 0 of a constant
 
     @classmethod
-    def of(cls, episodes: Sequence[NDArray[np.floating]]) -> "Signals":
-        """Those of the observations of some episodes, (n, d) each; what isn't finite is passed."""
-        squares, count = np.zeros(episodes[0].shape[1]), 0
-        low, high = squares + np.inf, squares - np.inf
-        for episode in episodes:
-            finite = episode[np.isfinite(episode).all(axis=1)].astype(np.float64)
-            low = np.minimum(low, finite.min(axis=0, initial=np.inf))
-            high = np.maximum(high, finite.max(axis=0, initial=-np.inf))
-            squares += (np.diff(finite, axis=0) ** 2).sum(axis=0)
-            count += max(len(finite) - 1, 0)
-        return cls(low, high, np.sqrt(squares / max(count, 1)))
+    def of(cls, observations: NDArray[Any]) -> "Signals":
+        """Those of the finite ones of some observations, (n, d)."""
+        finite = observations[np.isfinite(observations).all(axis=1)].astype(np.float64)
+        return cls(finite.min(axis=0, initial=np.inf), finite.max(axis=0, initial=-np.inf))
 
-    def plus(self, offset: Array) -> "Signals":
-        """Of the features before an offset, (d,), was subtracted."""
-        return Signals(self.low + offset, self.high + offset, self.change)
-
-    def with_more(self, other: "Signals") -> "Signals":
-        """Of these and others, by the larger changes."""
-        return Signals(
-            np.minimum(self.low, other.low),
-            np.maximum(self.high, other.high),
-            np.maximum(self.change, other.change),
-        )
+    def joined(self, other: "Signals") -> "Signals":
+        """Those of these and of others."""
+        return Signals(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
 
 
 def precision_problems(task: Task, signals: Signals | None) -> Iterator[str]:
     """A line for each feature of which 32 bits lose what changes, with an offset that helps."""
     if signals is None:
         return
-    for i, name in enumerate(task.feature_names):
-        low, high = signals.low[i] - task.offset[i], signals.high[i] - task.offset[i]
-        largest, change = max(abs(low), abs(high)), signals.change[i]
-        if not np.isfinite(largest) or largest < _LARGE or not change:
-            continue
-        offset, spacing = np.floor(signals.low[i]), float(np.spacing(np.float32(largest)))
-        if change < _CHANGES * spacing:
+    for name, offset, low, high in zip(task.feature_names, task.offset, *signals, strict=True):
+        largest = max(abs(low - offset), abs(high - offset))
+        spacing = float(np.spacing(np.float32(largest)))
+        if _LARGE < largest < np.inf and 0 < high - low < _LEVELS * spacing:
             yield (
-                f"{task.name}: {name} is near {signals.low[i]:.10g} and changes by about "
-                f"{change:.3g} from step to step, but numbers of 32 bits are {spacing:.3g} apart "
-                f"there: give it an offset in --features, such as offset = {offset:.10g}"
+                f"{task.name}: {name} is from {low:.10g} to {high:.10g}, but numbers of 32 bits "
+                f"are {spacing:.3g} apart there: give it an offset in --features, such as offset = "
+                f"{np.floor(low):.10g}"
             )

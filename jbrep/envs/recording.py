@@ -68,7 +68,7 @@ def read_states(lanes: Lanes) -> Mapping[str, Array]:
     return {name: lanes.arrays[name] for name in lanes.task.state}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording:
     """What n lanes went through in T steps; the first axis is time.
 
@@ -96,20 +96,9 @@ class Recording:
     length: NDArray[np.int32]
     missing: NDArray[np.int64]
 
-    def __repr__(self) -> str:
-        steps, lanes = self.reward.shape
-        return f"Recording({lanes} lanes, {steps} steps)"
-
 
 def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = read_nothing) -> Recording:
-    """Play the episodes that the lanes are at the start of, and record them.
-
-    Args:
-        lanes: at the start of their episodes.
-        act: the policy.
-        tick: called after each step.
-        read: what else to record.
-    """
+    """Play the episodes that the lanes are at the start of, and record them."""
     start, reads = _copied(lanes.arrays), [_copied(read(lanes))]
     observations = [lanes.observation]
     actives, actions, rewards = [], [], []
@@ -173,14 +162,7 @@ def episode_returns(lanes: Lanes, act: Actor, first_seed: int = 0) -> Array:
 def whole_outcome(
     lanes: Lanes, begin: Callable[[], Actor], first_seed: int, tick: Tick = lambda steps: None
 ) -> Outcome:
-    """As `outcome`; episodes in which the environment failed are played again.
-
-    Args:
-        lanes: whose retries say how often.
-        begin: acts from the start of episodes on.
-        first_seed: of the first lane.
-        tick: called after each step.
-    """
+    """As `outcome`; episodes in which the environment failed are begun and played again."""
     while True:
         found = outcome(lanes, begin(), first_seed, tick)
         if not lanes.has_failed:

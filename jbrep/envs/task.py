@@ -406,12 +406,9 @@ def most_held(missing: str) -> int:
 
 
 def check_same(expected: Task, actual: Task, what: str) -> None:
-    """Make sure that two descriptions are of the same observations.
+    """Make sure that what was made for the actual task has the observations of the expected one.
 
-    Args:
-        expected: the task at hand.
-        actual: the one that something was made for; another body of the same robot will do.
-        what: was made for it, for the message.
+    Another body of the same robot will do.
     """
     if actual.id != expected.id:
         raise InputError(

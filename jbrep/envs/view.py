@@ -18,10 +18,8 @@ def with_view(task: Task, hidden: Iterable[str] = (), history: int = 1) -> Task:
     then the last action, the one before, and so on: `speed`, `speed.1`, `action.1`. Before an
     episode's start, it stood still: its first state, and actions of 0 or the nearest to it.
 
-    Args:
-        task: without a view.
-        hidden: names or patterns, as in `velocity_*`, of features or groups to leave out.
-        history: states that are seen, the current one among them.
+    Hidden are names or patterns, as in `velocity_*`, of features or groups; of the history counts
+    the current state, too.
     """
     if task.view:
         raise InputError(f"some of {task.name} is hidden, or seen with its past, already")
@@ -53,24 +51,13 @@ class Window:
         self._actions = np.zeros((num_lanes, view.history - 1, task.action_size))
 
     def begin(self, lanes: Sequence[int] | NDArray[np.int64], given: NDArray[Any]) -> Array:
-        """What is seen in all lanes, (n, d), after an episode began in some.
-
-        Args:
-            lanes: their numbers.
-            given: by the environment, (n, D).
-        """
+        """What is seen in all lanes, (n, d), after an episode began in some; given is (n, D)."""
         self._states[lanes] = given[lanes][:, None, self._places]
         self._actions[lanes] = self._rest
         return self._seen()
 
     def step(self, moved: NDArray[np.bool_], actions: NDArray[Any], given: NDArray[Any]) -> Array:
-        """What is seen in all lanes, (n, d), after a step.
-
-        Args:
-            moved: the lanes that took it, (n,).
-            actions: that were taken, (n, k).
-            given: by the environment, (n, D).
-        """
+        """What is seen in all lanes, (n, d), after a step of those that moved, (n,)."""
         for past, now in ((self._states, given[:, self._places]), (self._actions, actions)):
             if past.shape[1]:
                 past[moved, 1:] = past[moved, :-1]
@@ -89,13 +76,7 @@ class Window:
 
 
 class Seen:
-    """A batch of environments, of which only what a task's view shows is seen.
-
-    Args:
-        batch: as `Lanes` steps one.
-        task: with a view.
-        num_lanes: n.
-    """
+    """A batch of environments, as `Lanes` steps one, of which a task's view is seen."""
 
     def __init__(self, batch: Any, task: Task, num_lanes: int):
         assert task.view
@@ -124,12 +105,8 @@ def seen_in_episodes(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What is seen in recorded episodes, before each step (N, d) and at the end of each (n, d).
 
-    Args:
-        task: with a view.
-        observation: that the environment gave before each step, (N, D).
-        action: of each step, (N, k).
-        final: the last observation of each episode, (n, D).
-        length: steps of each episode, (n,), N in all.
+    The environment gave observations (N, D) before actions (N, k), and final ones (n, D) in
+    episodes of n lengths, N in all.
     """
     view = task.view
     assert view

@@ -34,8 +34,7 @@ from jbrep.evaluate.regression import Networks, beside, fit
 from jbrep.machine import cores
 from jbrep.progress import Progress
 from jbrep.records.document import read_document
-from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder
+from jbrep.records.storage import exclusive, exists, make_folder
 from jbrep.stats.bootstrap import RESAMPLES
 from jbrep.training.trainer import single_thread
 

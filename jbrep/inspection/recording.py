@@ -11,8 +11,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from jbrep.errors import InputError
-from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder, write_whole
+from jbrep.records.storage import exclusive, exists, make_folder, write_whole
 
 PROVENANCE = "provenance"
 SUFFIX = ".rrd"

@@ -10,8 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.coordinates.nearest import continuous
-from jbrep.coordinates.placing import placed
+from jbrep.coordinates.placing import continuous, placed
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import find
 from jbrep.encoders.base import BaseEncoder

@@ -94,12 +94,7 @@ class Body:
 
 
 def draw(number: int, materials: bool = False) -> Body:
-    """The body of a number, the same each time.
-
-    Args:
-        number: 0 to 2^31 - 1.
-        materials: draw densities and gear, too; the geometry is the same either way.
-    """
+    """The body of a number, 0 to 2^31 - 1, the same each time; its shape with any materials."""
     random = np.random.default_rng((_STREAM, number))
     body = _draw(number, random)
     while body.strikes():

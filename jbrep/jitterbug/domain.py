@@ -47,18 +47,6 @@ class Physics(mujoco.Physics):
             tasks.yaw_direction(data.mocap_quat),
         )
 
-    def uprightness(self) -> float:
-        """Cosine of the angle between the bug's z axis and the world's."""
-        return float(self.readings().uprightness[0])
-
-    def angle_to_target(self) -> float:
-        """Angle from the bug's heading to the target's yaw [rad]."""
-        return float(self.readings().angle_to_target[0])
-
-    def distance_to_target(self) -> float:
-        """Distance from the bug's origin to the target [m]."""
-        return float(self.readings().distance_to_target[0])
-
 
 class Jitterbug(base.Task):
     """One of the five tasks.

@@ -20,9 +20,8 @@ from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, JitterbugTask, get_task
 from jbrep.opengl import has_display, no_opengl, prepare_opengl
 
-Observation = NDArray[Any] | dict[str, NDArray[Any]]
+Observation = NDArray[Any]
 
-_FORMS = {form: form for form in ("flat", "dict")}
 _TYPES = {name: np.dtype(name) for name in ("float32", "float64")}
 _BODY_ARGUMENTS = {"body", "materials"}
 _ACTIONS = spaces.Box(-1, 1, (1,), np.float32)
@@ -30,32 +29,21 @@ _ACTIONS = spaces.Box(-1, 1, (1,), np.float32)
 
 @dataclass(frozen=True)
 class _View:
-    """How observations are given: scaled or not, in which form and precision."""
-
     task: JitterbugTask
     scaled: bool
-    form: str
     dtype: str = "float32"
 
     def __post_init__(self) -> None:
-        choose(self.form, _FORMS, "form")
         choose(self.dtype, _TYPES, "dtype")
 
     @property
-    def space(self) -> spaces.Space[Any]:
-        if self.form == "flat":
-            return self._box(self.task.plain.size)
-        return spaces.Dict([(o.name, self._box(len(o.features))) for o in self.task.observables])
-
-    def _box(self, size: int) -> spaces.Box:
-        return spaces.Box(-np.inf, np.inf, (size,), _TYPES[self.dtype].type)
+    def space(self) -> spaces.Box:
+        return spaces.Box(-np.inf, np.inf, (self.task.plain.size,), _TYPES[self.dtype].type)
 
     def __call__(self, observation: Array) -> Observation:
-        """Convert observations in physical units, (..., d), to the form of the space."""
-        if self.scaled:
-            observation = self.task.plain.scale(observation)
-        given = observation.astype(_TYPES[self.dtype])
-        return given if self.form == "flat" else self.task.plain.split(given)
+        """Convert observations in physical units, (..., d), to those of the space."""
+        given = self.task.plain.scale(observation) if self.scaled else observation
+        return given.astype(_TYPES[self.dtype])
 
 
 def describe(arguments: Mapping[str, Any], max_episode_steps: int | None) -> Task:
@@ -77,7 +65,6 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         task: a key of `jbrep.jitterbug.tasks.TASKS`.
         scaled: scale features by their usual ranges to about [-1, 1] instead of giving physical
             units.
-        form: "flat" for one array (d,), "dict" for a dictionary of observables.
         render_mode: "rgb_array", "depth_array", "human" or None.
         camera: "overhead", "tracking" or "egocentric".
         width, height: of a frame [pixels].
@@ -97,7 +84,6 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self,
         task: str,
         scaled: bool = False,
-        form: str = "flat",
         render_mode: str | None = None,
         camera: str = "tracking",
         width: int = 640,
@@ -106,7 +92,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         materials: bool = False,
     ):
         self.task = get_task(task)
-        self.scaled, self._view = scaled, _View(self.task, scaled, form)
+        self.scaled, self._view = scaled, _View(self.task, scaled)
         modes = self.metadata["render_modes"]
         if not has_display():  # opening a window would abort the process
             modes = [mode for mode in modes if mode != "human"]
@@ -202,7 +188,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
     each: a number, and factors of what the model has.
 
     Args:
-        task, scaled, form, body, materials: as for `JitterbugEnv`.
+        task, scaled, body, materials: as for `JitterbugEnv`.
         num_envs: how many robots.
         max_episode_steps: the time limit, in control steps.
         num_threads: threads to step them on; None takes one for each core.
@@ -220,7 +206,6 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         task: str,
         num_envs: int = 1,
         scaled: bool = False,
-        form: str = "flat",
         max_episode_steps: int = EPISODE_STEPS,
         num_threads: int | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
@@ -238,7 +223,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         self.simulation = Simulation(self.task, num_envs, num_threads, body, materials)
         self.metadata = {"autoreset_mode": autoreset_mode}
         self._resets = autoreset_mode == AutoresetMode.SAME_STEP
-        self.scaled, self._view = scaled, _View(self.task, scaled, form, dtype)
+        self.scaled, self._view = scaled, _View(self.task, scaled, dtype)
         self._max_steps = max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._generators = [np.random.default_rng() for _ in range(num_envs)]

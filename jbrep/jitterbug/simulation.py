@@ -1,26 +1,83 @@
-"""Many Jitterbugs, stepped together on a pool of threads."""
+"""Many Jitterbugs, stepped together on a pool of threads, and the models that they have."""
 
 import copy
+import ctypes
 from collections.abc import Iterable, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import mujoco
 import numpy as np
+from mujoco import _batch
 from mujoco.batch import Batch
 from numpy.typing import ArrayLike, NDArray
 
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.physics import put_factors, turned, turned_quaternion, velocity_after
 from jbrep.envs.task import Array
-from jbrep.jitterbug import bodies, model
-from jbrep.jitterbug.tasks import QUATERNION, JitterbugTask, Readings, yaw_direction
+from jbrep.jitterbug import bodies
+from jbrep.jitterbug.tasks import (
+    CONTROL_TIMESTEP,
+    QUATERNION,
+    JitterbugTask,
+    Readings,
+    yaw_direction,
+)
 
+PHYSICS_TIMESTEP = 0.0002  # [s]
+PHYSICS_STEPS = round(CONTROL_TIMESTEP / PHYSICS_TIMESTEP)  # in a control step
+_ARENA = 1 << 20  # [bytes] per robot; MuJoCo's own choice is 14 times as large
 _UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 # on a position, velocity or acceleration that isn't finite, MuJoCo warns and resets the lane
 _NOT_FINITE = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1
 )
+
+
+def plain_model(body: bodies.Body | None = None) -> mujoco.MjModel:
+    """The model as described; without a body, the published robot's."""
+    return _read_spec(body).compile()
+
+
+@lru_cache(maxsize=256)
+def fast_model(body: bodies.Body | None = None) -> mujoco.MjModel:
+    """The model with only the contacts that occur; trajectories are bit-identical.
+
+    Listing the pairs of robot and floor avoids the search for others, and a single robot needs no
+    constraint islands. Without textures a model takes 30 kB in place of 1.4 MB, and a tenth of the
+    time to compile. The model is shared: don't change it.
+    """
+    spec = _read_spec(body)
+    for texture in spec.textures:
+        texture.width = texture.height = 1
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
+    touching = [geom for geom in spec.geoms if geom.contype and geom.name != "floor"]
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
+    spec.memory = _ARENA
+    for geom in touching:
+        spec.add_pair(name=geom.name, geomname1="floor", geomname2=geom.name)
+    return spec.compile()
+
+
+def _read_spec(body: bodies.Body | None) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec.from_string(bodies.read_xml())
+    if body is not None:
+        body.reshape(spec)
+    return spec
+
+
+def stop_profiling() -> None:
+    """Turn off MuJoCo's profiling clock, read at every stage, in this process.
+
+    `mjData.timer` then stays zero; nothing else changes. If the symbol can't be found, the clock
+    stays on.
+    """
+    try:
+        clock = ctypes.c_void_p.in_dll(ctypes.CDLL(_batch.__file__), "mjcb_time")
+    except (OSError, ValueError):
+        return
+    clock.value = None
 
 
 class Simulation:
@@ -51,7 +108,7 @@ class Simulation:
     ):
         check_counts(num_lanes, num_threads)
         bodies.check_body(body, materials)
-        model.stop_profiling()
+        stop_profiling()
         self.task = task
         self.num_lanes = num_lanes
         self._body = body
@@ -59,7 +116,7 @@ class Simulation:
         first = body if isinstance(body, int) else bodies.PUBLISHED
         self._numbers = np.full(num_lanes, first, np.int64)
         self._factors = np.ones((num_lanes, 2))  # of friction and mass
-        self._models = [model.fast_model(self._drawn(first))] * num_lanes
+        self._models = [fast_model(self._drawn(first))] * num_lanes
         self._shown: dict[tuple[float, ...], mujoco.MjModel] = {}
         # persistent: a step reuses what has already been computed for the readings
         self._batch = Batch(self._models[0], num_lanes, num_threads or 0, persistent=True)
@@ -78,9 +135,6 @@ class Simulation:
         self._warmstart = self._batch.bind("qacc_warmstart")
         self.readings = Readings(*self._views)
 
-    def __repr__(self) -> str:
-        return f"Simulation({self.task.name}, {self.num_lanes:,} lanes)"
-
     def reset(
         self,
         lanes: Sequence[int],
@@ -88,15 +142,10 @@ class Simulation:
         numbers: Iterable[float] | None = None,
         factors: ArrayLike = 1.0,
     ) -> None:
-        """Start an episode in each of the lanes, drawn from its own generator.
+        """Start an episode in each of k lanes, drawn from its own generator.
 
-        A random body doesn't change what else is drawn from the generator, now or later.
-
-        Args:
-            lanes: k of them.
-            randoms: the generator of each.
-            numbers: of their bodies; None for the body of all.
-            factors: of friction and of mass, (k, 2); 1 for the model's.
+        A random body doesn't change what else is drawn from the generator, now or later. Numbers,
+        (k,), are those of other bodies than that of all; factors, (k, 2), of friction and mass.
         """
         randoms = list(randoms)
         if numbers is None:
@@ -189,7 +238,7 @@ class Simulation:
         for lane, number, own in zip(lanes, numbers, factors, strict=True):
             if number != self._numbers[lane] or (own != self._factors[lane]).any():
                 self._numbers[lane], self._factors[lane] = number, own
-                usual = model.fast_model(self._drawn(int(number)))
+                usual = fast_model(self._drawn(int(number)))
                 self._models[lane] = self._varied(lane, usual, self._scratch)
                 changed = True
         if changed:
@@ -211,11 +260,7 @@ class Simulation:
         return mujoco.MjData(self._models[0])
 
     def push(self, velocity: Array) -> None:
-        """Push robots in the middle of their episodes.
-
-        Args:
-            velocity: the impulse on each lane's core by the robot's mass, (n, 3) [m/s]; 0 is none.
-        """
+        """Push robots: by the impulse on each one's core by its mass, (n, 3) [m/s]; 0 is none."""
         lanes = np.flatnonzero(velocity.any(axis=1)).tolist()
         for lane in lanes:
             now, scratch = self.readings.qpos[lane], self._scratch
@@ -229,14 +274,12 @@ class Simulation:
         self.readings = Readings(*self._views)
 
     def step(self, action: Array) -> NDArray[np.bool_]:
-        """Hold the actions (n, 1) for one control step.
+        """Hold the actions (n, 1) for a control step; whether each lane has diverged so far, (n,).
 
-        Returns:
-            Whether each lane's physics has diverged since its reset, (n,). Such a lane and its
-            target were put in their default states, and its episode has ended.
+        Such a lane and its target were put in their default states, and its episode has ended.
         """
         self._control[:] = action
-        self._batch.step(nstep=model.PHYSICS_STEPS, stage=_UP_TO_VELOCITIES)
+        self._batch.step(nstep=PHYSICS_STEPS, stage=_UP_TO_VELOCITIES)
         self.readings = Readings(*self._views)
         return self._warnings.any(axis=1)
 
@@ -253,7 +296,7 @@ class Simulation:
         number = int(self._numbers[lane])
         key = (number, *self._factors[lane].tolist())
         if key not in self._shown:
-            usual = model.plain_model(self._drawn(number))
+            usual = plain_model(self._drawn(number))
             self._shown[key] = self._varied(lane, usual, mujoco.MjData(usual))
         return self._shown[key]
 

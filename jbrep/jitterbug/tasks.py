@@ -244,12 +244,7 @@ class JitterbugTask:
     def describe(
         self, arguments: Mapping[str, Any] | None = None, max_episode_steps: int | None = None
     ) -> Task:
-        """The task as plain data.
-
-        Args:
-            arguments: of the environment.
-            max_episode_steps: the time limit; 1,000 if not given.
-        """
+        """The task as plain data, of an environment with these arguments and time limit."""
         steps = EPISODE_STEPS if max_episode_steps is None else max_episode_steps
         given = dict(arguments or {})
         body = {"body": 1} if given.get("body") is not None else {}

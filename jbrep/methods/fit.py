@@ -25,8 +25,7 @@ from jbrep.methods.linear import DEVIATION, PCA, held_out_error, inverse_root, r
 from jbrep.methods.registry import METHODS, get_method, name_of
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
-from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder
+from jbrep.records.storage import exclusive, exists, make_folder
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method, Reconstructing
 from jbrep.training.objective import Layers
 from jbrep.training.trainer import Epoch, Trainer, default_batch_size, get_device, single_thread

@@ -55,12 +55,7 @@ def read(motion: Motion) -> Readings:
 
 
 def turn_targets(lanes: Lanes, yaw: float) -> None:
-    """Turn the target of every lane, at the start of its episode.
-
-    Args:
-        lanes: of Jitterbugs.
-        yaw: orientation of the targets [rad].
-    """
+    """Turn the target of every lane to that yaw [rad], at the start of its episode."""
     if jitterbug_task(lanes.task) is None:
         raise InputError(f"{lanes.task.name} has no target to turn: only the Jitterbug's tasks do")
     if lanes.task.domain:
@@ -73,11 +68,3 @@ def turn_targets(lanes: Lanes, yaw: float) -> None:
     targets = {"target_quaternion": np.tile(turned, (lanes.num_lanes, 1))}
     simulation.restore(**simulation.state | targets)
     lanes.observation = lanes.envs.look()
-
-
-def hold_diverged(task: Task, motion: Motion) -> Motion:
-    """The motion without a Jitterbug's state after its physics diverged, which is its default."""
-    if jitterbug_task(task) is None:
-        return motion
-    held = {name: np.concatenate((v[:-1], v[-2:-1])) for name, v in motion.arrays.items()}
-    return Motion(motion.model, held)

@@ -78,11 +78,8 @@ def read_perturbation(text: str) -> dict[str, str]:
 def domains_of(task: Task, chosen: Sequence[str]) -> tuple[dict[str, Domain | None], list[str]]:
     """The domains of a table's rows by what they are called, and what the robot lacks.
 
-    The first row is undisturbed.
-
-    Args:
-        task: what is played; its own domain, if it has one, has the second row.
-        chosen: as `read_perturbation` takes them; none for the usual ones that there can be.
+    The first row is undisturbed, the second the task's own domain, if it has one; the others are
+    what is chosen, as `read_perturbation` takes it, or the usual ones that there can be.
     """
     wanted = {text: read_perturbation(text) for text in chosen or USUAL}
     known = changeable(task)
@@ -106,12 +103,7 @@ def perturb(
 ) -> Iterator[Row]:
     """Play the same episodes in one domain after the other; each row as it is finished.
 
-    Args:
-        player: the policy.
-        domains: by what they are called; the first one is that which the others are shares of.
-        episodes: of each.
-        threads: as for `Player.returns`.
-        retries: likewise.
+    The first domain is that which the others are shares of.
     """
     first = None
     for name, domain in domains.items():

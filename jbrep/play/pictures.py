@@ -34,8 +34,6 @@ _GAP = 0.6  # around the text, in heights of a letter
 
 
 class _Studio(NamedTuple):
-    """What pictures of one model are taken with."""
-
     motion_model: mujoco.MjModel  # whose pictures they are; the renderer has a copy
     model: mujoco.MjModel
     data: mujoco.MjData

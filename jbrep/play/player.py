@@ -14,7 +14,7 @@ from jbrep.envs.physics import MotionReader
 from jbrep.envs.recording import Actor, Outcome, Recording, joined, record, whole_outcome
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
-from jbrep.play.jitterbug import hold_diverged, turn_targets
+from jbrep.play.jitterbug import turn_targets
 from jbrep.play.rollout import Rollout
 from jbrep.progress import Progress
 from jbrep.rl.files import EVALUATION_SEED
@@ -22,7 +22,6 @@ from jbrep.rl.settings import MAX_EPISODES
 
 Begin = Callable[[Task, Sequence[int]], Actor]  # as `Policy.begin`
 
-_MAX_BYTES = 35 * 10**8  # of the steps that `play` may return
 _BATCH_LANES, _SEPARATE_LANES = 1000, 16  # that `returns` steps at once
 
 
@@ -44,11 +43,6 @@ class Player(NamedTuple):
             episodes: their numbers, from 0.
             target_yaw: where every target of the Jitterbug points [rad]; None draws it.
         """
-        if len(episodes) * self._episode_bytes > _MAX_BYTES:
-            raise InputError(
-                f"{self.name} plays {len(episodes):,} episodes of {self.task.max_episode_steps:,} "
-                f"steps at once: at most {_MAX_BYTES // self._episode_bytes:,} are possible"
-            )
         if len(episodes) > 1 and not self.task.reproducible:  # a robot may exist once
             return [each for episode in episodes for each in self.play([episode], target_yaw)]
         seeds = [EVALUATION_SEED + episode for episode in episodes]
@@ -80,10 +74,6 @@ class Player(NamedTuple):
 
     def _rollout(self, recording: Recording, lane: int, seed: int, read: MotionReader) -> Rollout:
         steps = int(recording.length[lane])
-        truncated = bool(recording.truncated[lane])
-        motion = read.motion(recording, lane, steps)
-        if motion and truncated and steps < self.task.max_episode_steps:
-            motion = hold_diverged(self.task, motion)
         return Rollout(
             task=self.task,
             name=self.name,
@@ -92,22 +82,16 @@ class Player(NamedTuple):
             action=recording.action[:steps, lane],
             reward=recording.reward[:steps, lane],
             terminated=bool(recording.terminated[lane]),
-            truncated=truncated,
-            motion=motion,
+            truncated=bool(recording.truncated[lane]),
+            motion=read.motion(recording, lane, steps),
             encoder=self.encoder,
         )
 
     def returns(self, count: int, threads: int | None = None, retries: int = 0) -> Array:
         """Returns of the first `count` of these episodes, (count,).
 
-        Args:
-            count: of episodes.
-            threads: to step a batch on, or instances of other environments, which are also played
-                in one where no second can be made.
-            retries: how often in a row an episode in which the environment fails is played again.
-
-        Raises:
-            EnvironmentFailedError: the environment fails.
+        Threads are those to step a batch on, or instances of other environments, which are also
+        played in one where no second can be made.
         """
         return joined(self.outcomes_in_turn(count, threads, retries)).returns
 
@@ -130,11 +114,6 @@ class Player(NamedTuple):
                         begin = partial(self.begin, self.task, range(first, first + size))
                         yield whole_outcome(lanes, begin, first, bar.update)
                         played += size
-
-    @property
-    def _episode_bytes(self) -> int:
-        """About what an episode of the longest takes in memory."""
-        return (16 * self.task.size + 100) * self.task.max_episode_steps
 
     def with_reconstruction(self, encoder: BaseEncoder) -> "Player":
         """The same policy, which now observes what an encoder's latent is decoded to.

@@ -44,24 +44,8 @@ class Rollout:
     note: str = ""
     encoder: BaseEncoder | None = None
 
-    def __post_init__(self) -> None:
-        steps = len(self.action)
-        shapes = {
-            "action": (steps, self.task.action_size),
-            "observation": (steps + 1, self.task.size),
-            "reward": (steps,),
-        }
-        for name, shape in shapes.items():
-            if (actual := getattr(self, name).shape) != shape:
-                raise InputError(
-                    f"a rollout of {steps} actions has {name} of shape {actual}: it must be {shape}"
-                )
-
     def __len__(self) -> int:
         return len(self.action)
-
-    def __repr__(self) -> str:
-        return f"Rollout({self.name!r}: {self.task.name}, {len(self):,} steps)"
 
     @property
     def episode_return(self) -> float:

@@ -1,21 +1,24 @@
-"""What a user names: an episode of a data set, the policy of a run, or one by its name."""
+"""What a user names: an episode of a data set, or a policy of a run, in a file, or by its name."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from jbrep.collect.policies import POLICIES, Policy, make_policy, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import FULL
-from jbrep.envs.task import Task, check_same
-from jbrep.errors import InputError
+from jbrep.envs.recording import Actor, held
+from jbrep.envs.task import Array, Task, check_same
+from jbrep.errors import DamageError, InputError, first_line, refusing
 from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.player import Player
 from jbrep.play.rollout import Rollout, replay
-from jbrep.records.storage import exists
+from jbrep.records.storage import exists, read_file
 from jbrep.rl.files import POLICY, POLICY_ZIP, check_begun, is_policy_file, is_run
 from jbrep.rl.policy_file import SHIPPED, find_shipped
 
@@ -50,19 +53,11 @@ def find_episode(
 
 
 def find_policy(text: str, folder: Path, task: Task) -> Policy:
-    """The policy that a text names, to collect with: of a run, by its name, or a mixture of them.
+    """The policy that a text names, to collect with in the folder of a data set.
 
-    The policy of a run is frozen: it is the one that the data set has already, or else the run's
-    last.
-
-    Args:
-        text: the run's folder or a policy's file, a name such as constant:drive=0.5, or a mixture
-            such as uniform:0.5+runs/a:0.5.
-        folder: of the data set.
-        task: of the data set.
-
-    Raises:
-        DamageError: a file isn't what was written.
+    It is the folder of a run or the file of a policy, a name such as constant:drive=0.5, or a
+    mixture such as uniform:0.5+runs/a:0.5. The policy of a run is frozen: it is the one that the
+    data set has already, or else the run's last.
     """
     taken: list[str] = []
 
@@ -154,10 +149,8 @@ def find_good_policy(
 ) -> "GoodPolicy | None":
     """A policy with the episodes that it plays: the first of those that runs are evaluated on.
 
-    Args:
-        source: as `find_player` takes it; None for the hand-written policy, if the task has one.
-        task: to act in.
-        own_rewards: whether rewards are others than the environment gives: nothing is played then.
+    Without a source it is the hand-written policy, if the task has one. Nothing is played where
+    rewards are others than the environment gives.
     """
     if source is None:
         if own_rewards or jitterbug_task(task) is None:
@@ -187,13 +180,6 @@ def run_folder(source: str) -> Path | None:
     return folder if source != SHIPPED and is_run(folder) else None
 
 
-def find_untrained(folder: Path, task: Task) -> Player:
-    """The policy that a run began with, to play a task of the same environment."""
-    from jbrep.rl.policy import load_untrained  # imports torch
-
-    return as_player(f"{folder}, before training", load_untrained(folder), task)
-
-
 def _trained(source: str, task: Task | None, encoder: Any) -> Player:
     from jbrep.rl.policy import (
         load_run,  # imports torch
@@ -211,7 +197,6 @@ def _trained(source: str, task: Task | None, encoder: Any) -> Player:
 
 
 def _check_task(source: str, own: Task, given: Task | None) -> None:
-    """Make sure that a task that is given, if any, is the source's."""
     if given and given.id != own.id:
         raise InputError(f"{source} is of {own.name}, not of {given.name}")
     if given:
@@ -229,3 +214,54 @@ def as_player(name: str, trained: "Trained", task: Task | None = None) -> Player
         trained.step,
         None if trained.encoder.kind == FULL else trained.encoder,
     )
+
+
+# policies in exported files, played as a robot would run them
+
+
+class Described(msgspec.Struct):
+    """What playing needs of what an exported policy says of itself."""
+
+    environment: Task
+    action_repeat: Annotated[int, Meta(ge=1)]
+
+
+def read_exported(path: Path) -> tuple[Any, Described]:
+    """The session of onnxruntime that computes a policy's actions, and what the file says of it."""
+    from jbrep.encoders.imported import session  # imports onnx
+
+    what = f"{path} isn't an ONNX model that can be run"
+    with refusing(what, told=first_line, kind=DamageError):
+        made = session(read_file(path))
+    text = made.get_modelmeta().custom_metadata_map.get("jbrep", "")
+    try:
+        return made, msgspec.json.decode(text, type=Described)
+    except msgspec.DecodeError:  # also of a field that doesn't fit
+        raise InputError(f"{path} isn't a policy that jbrep policy export wrote") from None
+
+
+def exported_player(path: Path, task: Task | None = None) -> Player:
+    """The policy in a file, to play its own task, maybe with another body or time limit."""
+    session, said = read_exported(path)
+    known = task or said.environment
+    check_same(known, said.environment, str(path))
+    ends = session.get_inputs(), session.get_outputs()
+    if any(len(end) != 1 or len(end[0].shape) != 2 for end in ends):
+        raise InputError(f"{path} isn't a policy that jbrep policy export wrote")
+    (given,), (made,) = ends
+    sizes = given.shape[1], made.shape[1]
+    if sizes != (known.size, known.action_size):
+        raise InputError(
+            f"{path} takes {sizes[0]} numbers and gives {sizes[1]}, but {known.name} observes "
+            f"{known.size} and acts by {known.action_size}: give its --task"
+        )
+
+    def act(observation: Array) -> NDArray[Any]:
+        with refusing(f"{path} can't be run", told=first_line):
+            (action,) = session.run([made.name], {given.name: observation.astype("float32")})
+        return action
+
+    def begin(task: Task, seeds: Any) -> Actor:
+        return held(act, said.action_repeat)
+
+    return Player(str(path), known, begin)

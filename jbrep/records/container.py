@@ -44,11 +44,7 @@ def checksum(tensors: Tensors, header: Mapping[str, Any]) -> str:
 
 
 def read(path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
-    """Tensors and header of a file of what is named, once its checksum has been verified.
-
-    Raises:
-        DamageError: it isn't what was written.
-    """
+    """Tensors and header of a file of what is named, once its checksum has been verified."""
     if not exists(path):
         raise InputError(f"no {what} at {path}")
     return unpack(read_file(path), path, what)

@@ -1,6 +1,7 @@
-"""Documents: records in JSON files and headers, which say their format and its version first."""
+"""Files of plain data: JSON documents, which say their format and its version first, and TOML."""
 
 import json
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -24,11 +25,7 @@ class Document(Record, frozen=True):
         return {"format": self.format, "format_version": self.format_version, **to_plain(self)}
 
     def text(self) -> str:
-        """The text of its file.
-
-        Raises:
-            ValueError: a number in it is not finite.
-        """
+        """The text of its file; a ValueError if a number in it is not finite."""
         return json.dumps(self.as_json(), indent=self.indent, allow_nan=False) + "\n"
 
     def write(self, path: Path) -> None:
@@ -40,11 +37,7 @@ _Document = TypeVar("_Document", bound=Document)
 
 
 def read_document(path: Path, kind: type[_Document]) -> _Document:
-    """The document that a JSON file holds, every field checked.
-
-    Raises:
-        DamageError: it isn't such a document.
-    """
+    """The document that a JSON file holds, every field checked."""
     return document_from(parse_json(read_file(path), path, kind.format), path, kind)
 
 
@@ -66,12 +59,31 @@ def document_from(given: Mapping[str, Any], path: Path, kind: type[_Document]) -
 
 
 def parse_json(raw: bytes, path: Path, what: str) -> dict[str, Any]:
-    """A JSON object from bytes: all its numbers finite, all its text in UTF-8.
-
-    Raises:
-        DamageError: it isn't one.
-    """
+    """A JSON object from bytes."""
     try:
         return msgspec.json.decode(raw, type=dict[str, Any])
     except (msgspec.DecodeError, RecursionError, ValueError) as error:
         raise DamageError(f"{path} is damaged, or not a {what} file: {error}") from None
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The contents of a TOML file."""
+    try:
+        return tomllib.loads(read_file(path).decode())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}") from None
+
+
+def toml_text(tables: Mapping[str, Any]) -> str:
+    """Tables as TOML; None, which TOML lacks, as the text "none"."""
+    import tomli_w  # only writers need it
+
+    return tomli_w.dumps(_without_null(tables))
+
+
+def _without_null(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _without_null(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_null(each) for each in value]
+    return "none" if value is None else value

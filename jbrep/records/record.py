@@ -11,8 +11,9 @@ https://jcristharif.com/msgspec/constraints.html
 
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from decimal import Decimal
+from itertools import chain
 from typing import Annotated, Any, Self, TypeVar
 
 import msgspec
@@ -37,7 +38,6 @@ Finite = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 Version = Annotated[str, pattern(r"(?a)\A\w[\w.+!-]*\Z", "a version")]  # or the name of a package
 Sha256 = Annotated[str, pattern(r"\A[0-9a-f]{64}\Z", "a SHA-256: 64 hexadecimal digits")]
 
-_MESSAGE = re.compile(r"(.*?)(?: - at `\$(.*)`)?", re.DOTALL)  # msgspec's, and where
 _FIELD = re.compile(r"Object (missing required|contains unknown) field `(.*)`")
 _STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]")
 _WITH_PARTS = (
@@ -71,12 +71,9 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def from_plain(value: Any, kind: type[_Kind], where: str = "") -> _Kind:
-    """A record, or any other type, from plain JSON or TOML.
+    """A record, or another class, from plain JSON or TOML.
 
-    Args:
-        value: as json.loads or tomllib.loads return it.
-        kind: the class, or another type that msgspec knows.
-        where: the value stands, for messages: "data" makes them speak of data.steps.
+    What it is called in messages is `where`: "data" makes them speak of data.steps.
     """
     return converted(value, kind, where)
 
@@ -121,15 +118,13 @@ def converted(value: Any, kind: Any, where: str, strict: bool = True) -> Any:
 
 def _line(message: str, value: Any, kind: Any, where: str) -> str:
     """A message of msgspec's as a line with the place, the value and what that must be."""
-    found = _MESSAGE.fullmatch(message)
-    reason, path = found.groups("") if found else (message, "")
-    place = f"{where}{path}".removeprefix(".")
-    told = [type_of(kind)]
-    nodes = [*_plain(told)]
-    for field, index in _STEP.findall(path):
-        told = [part for each in nodes for part in _parts(each, field or index)]
-        nodes = [*_plain(told)]
-        value = _inside(value, field or index)
+    reason, _, path = message.partition(" - at `$")
+    path = path.removesuffix("`")
+    steps = [field or index for field, index in _STEP.findall(path)]
+    place, found = f"{where}{path}".removeprefix("."), [*_at(type_of(kind), steps)]
+    nodes = [node for node, _ in found]
+    for step in steps:
+        value = _inside(value, step)
     if field := _FIELD.fullmatch(reason):
         name = f"{place}.{field[2]}" if place else field[2]
         if field[1].startswith("missing"):
@@ -138,9 +133,9 @@ def _line(message: str, value: Any, kind: Any, where: str) -> str:
     if reason.startswith("Expected "):
         must_be = reason.removeprefix("Expected ").partition(", got")[0]
         if "matching regex" in must_be:
-            must_be = next(_words(told), must_be)
+            must_be = next((words for _, words in found if words), must_be)
     elif reason.startswith("Invalid "):
-        must_be = _choices(nodes, "one of ")
+        must_be = _choices(nodes, "one of ") or "another"
     else:  # what `check` said
         return f"{place}: {reason}" if place else reason
     given = "" if value is UNSET else f" is {shown(value)}: it"
@@ -155,42 +150,27 @@ def _inside(value: Any, step: str) -> Any:
         return getattr(value, step, UNSET)
 
 
-def _plain(nodes: Iterable[inspect.Type]) -> Iterator[inspect.Type]:
-    """Types without their descriptions; of a union its parts."""
-    for node in nodes:
-        match node:
-            case inspect.Metadata(type=inner):
-                yield from _plain([inner])
-            case inspect.UnionType(types=types):
-                yield from _plain(types)
-            case _:
-                yield node
+def _at(
+    node: inspect.Type, steps: Sequence[str] = (), words: str = ""
+) -> Iterator[tuple[inspect.Type, str]]:
+    """The types that a part of a value may have, with what `pattern` says of them in words.
 
-
-def _words(nodes: Iterable[inspect.Type]) -> Iterator[str]:
-    """What `pattern` says of types in words."""
-    for node in nodes:
-        match node:
-            case inspect.Metadata(type=inner, extra=extra):
-                if extra and _IN_WORDS in extra:
-                    yield extra[_IN_WORDS]
-                yield from _words([inner])
-            case inspect.UnionType(types=types):
-                yield from _words(types)
-
-
-def _parts(node: inspect.Type, step: str) -> list[inspect.Type]:
-    """The types that a part of a value may have, of that field or at that place."""
+    Without any steps they are those of the value itself.
+    """
     match node:
-        case inspect.StructType(array_like=True, fields=fields):
-            return [fields[int(step)].type]
-        case inspect.StructType(tag_field=tag_field, tag=tag) if step == tag_field:
-            return [inspect.LiteralType((tag,))]
+        case inspect.Metadata(type=inner, extra=extra):
+            yield from _at(inner, steps, (extra or {}).get(_IN_WORDS, words))
+        case inspect.UnionType(types=types):
+            yield from chain(*(_at(each, steps, words) for each in types))
+        case _ if not steps:
+            yield node, words
+        case inspect.StructType(tag_field=tag_field, tag=tag) if tag_field == steps[0]:
+            yield inspect.LiteralType((tag,)), ""
         case inspect.StructType(fields=fields):
-            return [each.type for each in fields if each.encode_name == step]
+            found = (each.type for each in fields if each.encode_name == steps[0])
+            yield from chain(*(_at(each, steps[1:]) for each in found))
         case inspect.CollectionType(item_type=item) | inspect.DictType(value_type=item):
-            return [item]
-    return []
+            yield from _at(item, steps[1:])
 
 
 def _choices(nodes: Sequence[inspect.Type], before: str) -> str:
@@ -208,7 +188,7 @@ def type_of(kind: Any) -> inspect.Type:
 
 def bare(node: inspect.Type) -> inspect.Type:
     """A type without its description; of a union a list or table, or else the first part."""
-    return max(_plain([node]), key=lambda each: isinstance(each, _WITH_PARTS))
+    return max((each for each, _ in _at(node)), key=lambda each: isinstance(each, _WITH_PARTS))
 
 
 def to_plain(value: Any) -> Any:

@@ -1,15 +1,18 @@
-"""Files are written whole or not at all."""
+"""Files are written whole or not at all, by one writer at a time."""
 
 import os
 import shutil
+import socket
 import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+import filelock
+
 from jbrep.errors import InputError
-from jbrep.records.lock import exclusive
 
 _PARTIAL = ".partial"
 
@@ -55,6 +58,36 @@ def write_new(path: Path, content: bytes) -> None:
 
 
 @contextmanager
+def exclusive(path: Path, *, beside: bool = False, wait: float = 0) -> Iterator[None]:
+    """Be the only writer in a folder, which has a file `.lock` until the process ends or lets go.
+
+    With `beside`, the lock stands beside the path, which may not exist yet. For another process it
+    waits so many seconds at most.
+    """
+    if beside and not path.name:
+        raise InputError(f"{path} can't be a new file or folder: give it a name")
+    note = path.with_name(f".{path.name}.lock") if beside else path / ".lock"
+    lock, holder = filelock.FileLock(note), ""
+    try:
+        lock.acquire(timeout=wait)
+        now = datetime.now().astimezone().isoformat(" ", "seconds")
+        note.write_text(f"process {os.getpid()} on {socket.gethostname()} since {now}")
+    except filelock.Timeout:
+        with suppress(OSError):  # released and removed meanwhile
+            holder = note.read_text()
+        who = holder or "another process"
+        raise InputError(f"{path} is being written by {who}: wait for it or stop it") from None
+    except OSError as error:
+        lock.release()
+        raise InputError(f"can't write in {note.parent}: {error.strerror or error}") from error
+    try:
+        yield
+    finally:
+        note.unlink(missing_ok=True)  # filelock notices that a lock it gets was removed
+        lock.release()
+
+
+@contextmanager
 def unfinished(path: Path) -> Iterator[Path]:
     """A temporary place beside a new file or folder, for one writer at a time, to `publish`.
 
@@ -72,11 +105,7 @@ def unfinished(path: Path) -> Iterator[Path]:
 
 
 def publish(partial: Path, path: Path) -> None:
-    """Bring a file, or a folder with all its files, to the disk, then give it its name.
-
-    Raises:
-        OSError: that can't be, as where the name is that of a folder with files.
-    """
+    """Bring a file, or a folder with all its files, to the disk, then give it its name."""
     for each in (*partial.rglob("*"), partial):
         sync(each)
     partial.replace(path)
@@ -100,10 +129,7 @@ def exists(path: str | Path) -> bool:
 def make_folder(folder: Path, own: Collection[str] = ()) -> None:
     """Make a folder and its parents unless they exist, and see that files can be written there.
 
-    Args:
-        folder: to make.
-        own: names of what marks a folder as one of those that are to be written, with * for any
-            letters; none if it may hold anything.
+    One that holds other things is refused, unless some have the names of its `own`, patterns.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -121,7 +147,7 @@ def make_folder(folder: Path, own: Collection[str] = ()) -> None:
 
 
 def check_space(folder: Path, needed: int) -> None:
-    """Make sure that enough bytes are free."""
+    """Make sure that so many bytes are free."""
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise InputError(

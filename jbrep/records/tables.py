@@ -55,9 +55,6 @@ def read_csv(
         columns: the header must have these, and no others unless `further` is given.
         sha256: of the file, if it is known.
         further: what cells of all other columns are; each row then ends with a dictionary of them.
-
-    Raises:
-        DamageError: it is another table.
     """
     raw = read_file(path)
     if sha256 is not None and hashlib.sha256(raw).hexdigest() != sha256:

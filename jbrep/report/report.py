@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from jbrep.progress import Progress
-from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder, write_whole
+from jbrep.records.storage import exclusive, exists, make_folder, write_whole
 from jbrep.report import views
 from jbrep.report.diagnostics import add_diagnostics
 from jbrep.report.figures import Plot, study_plots, write

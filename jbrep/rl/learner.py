@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from jbrep.errors import InputError
+from jbrep.records.document import read_toml, toml_text
 from jbrep.records.record import Record
-from jbrep.records.toml import read_toml, toml_text
 from jbrep.rl.overrides import overridden
 from jbrep.rl.presets import PRESETS, Hyperparameters, get_preset
 from jbrep.rl.settings import MAX_NAME, PAPER, LearnerName, base_name

@@ -23,8 +23,7 @@ from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError, StoppedError
 from jbrep.machine import cpu
 from jbrep.records.commit import commits
-from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder, read_file, write_whole
+from jbrep.records.storage import exclusive, exists, make_folder, read_file, write_whole
 from jbrep.records.tables import write_csv, write_rows
 from jbrep.rl.agent import (
     acting,

@@ -13,9 +13,8 @@ from optuna.trial import TrialState
 
 from jbrep.errors import InputError, differences
 from jbrep.records.document import Document, read_document
-from jbrep.records.lock import exclusive
 from jbrep.records.record import Version
-from jbrep.records.storage import exists, make_folder, write_whole
+from jbrep.records.storage import exclusive, exists, make_folder, write_whole
 from jbrep.rl.files import FINISHED, last_returns, read_evaluations
 from jbrep.rl.learner import preset_text
 from jbrep.rl.overrides import setting_names

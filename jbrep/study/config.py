@@ -19,10 +19,9 @@ from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS
-from jbrep.records.document import Document
+from jbrep.records.document import Document, read_toml, toml_text
 from jbrep.records.record import Record, converted, from_plain, pattern, to_plain
 from jbrep.records.storage import exists
-from jbrep.records.toml import read_toml, toml_text
 from jbrep.rl.learner import Learner
 from jbrep.rl.presets import learns_from
 from jbrep.rl.settings import MAX_STEPS, Seed, TrainingSettings

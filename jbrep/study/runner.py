@@ -18,8 +18,7 @@ from jbrep.envs.names import import_modules, imported_modules
 from jbrep.errors import first_line
 from jbrep.machine import cores
 from jbrep.pool import ATTEMPTS, on_cluster, side_by_side, stop_requested
-from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder, write_note
+from jbrep.records.storage import exclusive, exists, make_folder, write_note
 from jbrep.rl import Session, StoppedError, train
 from jbrep.rl.files import FAILED, FINISHED, read_run, runs_below
 from jbrep.rl.history import History

@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from jbrep.dataset import Dataset
-from jbrep.dataset.verify import find_problems
+from jbrep.dataset.manifest import find_problems
 
 RATE = 100
 TIMES = np.concatenate((np.arange(60), 500 + np.arange(60))) / RATE

@@ -8,14 +8,7 @@ from pathlib import Path
 from attacks import Surface, command, digest, forked
 from click.testing import CliRunner
 from command import in_this_process
-from foreign import (
-    csv_rows,
-    lerobot_folder,
-    write_bag,
-    write_csv,
-    write_d4rl,
-    write_robomimic,
-)
+from foreign import csv_rows, write_bag, write_csv
 from rerun.chunk import RrdReader
 from small import brief
 
@@ -96,12 +89,7 @@ _JOINTS = ("--observations", "/joint_states.position.*", "--actions", "/arm/comm
 _BAG = (*_JOINTS, "--rate", "50", "--gap", "0.15")
 LOGS = {  # of other tools: what writes them, and what their columns are said to be
     "csv": (lambda folder: write_csv(folder / "walk.csv", csv_rows()), _LOG),
-    "a bag of ROS 1": (lambda folder: write_bag(folder / "walk.bag", "bag"), _BAG),
     "mcap": (lambda folder: write_bag(folder / "walk-mcap", "mcap"), _BAG),
-    "a bag of ROS 2": (lambda folder: write_bag(folder / "walk-db3", "db3"), _BAG),
-    "lerobot": (lambda folder: lerobot_folder(folder / "arm"), ()),
-    "d4rl": (lambda folder: write_d4rl(folder / "hopper.hdf5"), ()),
-    "robomimic": (lambda folder: write_robomimic(folder / "lift.hdf5"), ()),
 }
 SMALL = {"net_arch": [4], "num_envs": 1}
 CHEAP = {"net_arch": [8], "learning_starts": 8, "batch_size": 8, "buffer_size": 100}

@@ -37,7 +37,7 @@ class WideDataset:
         folder: for a file of the observations, which is mapped; None keeps them in memory.
     """
 
-    split, split_episodes = Dataset.split, Dataset.split_episodes
+    split = Dataset.split
     fit_scaler = Dataset.fit_scaler
 
     def __init__(self, lengths, features=348, folder=None):

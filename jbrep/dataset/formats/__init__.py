@@ -35,16 +35,13 @@ def load_format(name: str) -> ModuleType:
 
 
 def export(dataset: "Dataset", to: str, out: Path) -> str:
-    """Write a data set in another format.
+    """Write a data set in another format; returns how to open it.
 
     Args:
         dataset: what to write.
         to: a key of `FORMATS`.
         out: a new file, which ends as its format does, or a folder; for Minari a folder of Minari
             data sets, new or not.
-
-    Returns:
-        How to open it.
     """
     module = load_format(to)
     if out.name and to in _FILES and out.suffix.lower() != f".{to}":
@@ -61,14 +58,7 @@ def export(dataset: "Dataset", to: str, out: Path) -> str:
 
 
 def open_sources(given: Sequence[str], layout: Layout | None = None, missing: str = "") -> "Source":
-    """Open what is to be imported together.
-
-    Args:
-        given: files of the kinds in `_FILES`, or folders of a bag, a LeRobot or a Minari data set,
-            or the id of the latter.
-        layout: what their columns are, before what their format says.
-        missing: what becomes of numbers that are missing, see `without_missing`.
-    """
+    """Open files and folders that are to be imported together, or a Minari data set by its id."""
     from jbrep.dataset.formats.source import Source
 
     paths = [Path(each).resolve() for each in given]

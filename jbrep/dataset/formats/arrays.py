@@ -57,13 +57,8 @@ def frame_of_steps(
 ) -> Frame:
     """The same of arrays that are called as in `ALIASES`.
 
-    Args:
-        name: of the source.
-        arrays: by their names.
-        once: what is known once for each of n episodes, as far as it is: final_observation
-            (n, ...), terminated, truncated and seed (n,).
-        about: the observations, which are numbered where that has no names.
-        more: of the frame.
+    What is known once for each of n episodes may be final_observation (n, ...), terminated,
+    truncated and seed (n,). Observations are numbered where nothing has their names.
     """
     own = own_names(name, arrays)
     check_names(name, own, arrays)
@@ -84,13 +79,9 @@ def frame_of_steps(
 
 
 def frame_in_python(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) -> Frame:
-    """Arrays in Python, see `from_arrays`.
+    """Arrays in Python, by the keys of `ALIASES`; those that are None aren't there.
 
-    Args:
-        columns: by the keys of `ALIASES`: a row for each step of all episodes, or a list with such
-            an array for each episode; those that are None aren't there.
-        once: as `frame_of_steps` takes it, likewise.
-        name: of the source.
+    They have a row for each step of all episodes, or are lists with such an array for each episode.
     """
     given = {what: values for what, values in columns.items() if values is not None}
     known = {what: values for what, values in once.items() if values is not None}

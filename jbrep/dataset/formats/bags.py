@@ -81,7 +81,6 @@ def _opened(path: Path) -> Iterator[AnyReader]:
 
 
 def _messages(reader: AnyReader, topics: set[str]) -> Iterator[_Numbers]:
-    """The numbers of messages of some topics, in the order of times."""
     connections = [each for each in reader.connections if each.topic in topics]
     for connection, time, raw in reader.messages(connections) if connections else ():
         try:

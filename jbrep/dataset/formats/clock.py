@@ -26,11 +26,7 @@ def parts_of(
 ) -> Iterator[Rows]:
     """The rows of an episode in parts that are whole and not too long, each row at its time.
 
-    Args:
-        rows: of the episode.
-        layout: which says how.
-        angles: which numbers of an observation jump by a full turn, (d,).
-        counts: of what was done, for the report.
+    Angles, (d,), are those numbers of an observation that jump by a full turn.
     """
     is_uneven = layout.rate is not None
     for part in _resampled(rows, layout, angles, counts) if is_uneven else _once_each(rows, counts):

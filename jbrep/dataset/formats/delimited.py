@@ -26,14 +26,10 @@ _PLACE = re.compile(r"\w[\[(]\d+[\])]$")  # of q[0], which is no unit
 _LONG = re.compile(r"-?\d{16,}")  # whole numbers that may lose digits as floats
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _NUMBERS, _TIMES = (pa.float64(), pa.bool_()), (pa.timestamp("ns"), pa.timestamp("ns", "UTC"))
-_PROBLEM = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?: (.*)")
-_SHORT = re.compile(r"CSV parse error: (?:Row #(\d+): )?(Expected .* got \d+)")
 _BLOCK = 1 << 20  # bytes read at a time
 
 
 class _Form(NamedTuple):
-    """How a file is written."""
-
     separator: str
     decimal: str
     begin: int  # lines before the first row
@@ -52,7 +48,7 @@ def read(given: str) -> Frame:
         schema=form.schema,
         batches=lambda columns: _batches(path, form, columns),
         about={name: About(units=(unit,)) for name, unit in named if unit},
-        place=lambda row: f"line {_line_of(path, form, row)}",
+        place=lambda row: f"row {row + 1} below the names",
     )
 
 
@@ -103,7 +99,6 @@ def _names(header: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _type(cell: str, decimal: str = ".") -> pa.DataType:
-    """What a cell that isn't empty holds."""
     if _LONG.fullmatch(cell):
         return pa.int64()  # exact, as of times in ns
     for kind in _TIMES if ":" in cell else _NUMBERS:
@@ -114,43 +109,16 @@ def _type(cell: str, decimal: str = ".") -> pa.DataType:
 
 
 def _batches(path: Path, form: _Form, columns: list[str]) -> Iterator[pa.RecordBatch]:
-    """The rows of some columns, some at a time."""
     lines = {"use_threads": False, "block_size": _BLOCK}  # threads lose count of the lines
     cells = {"null_values": _EMPTY, "strings_can_be_null": True, "decimal_point": form.decimal}
-    try:
-        with pa_csv.open_csv(
+    what = f"{path} can't be read as rows of text"
+    with (
+        refusing(what, (OSError, pa.ArrowException), told=first_line),
+        pa_csv.open_csv(
             path,
             pa_csv.ReadOptions(skip_rows=form.begin, column_names=form.schema.names, **lines),
             pa_csv.ParseOptions(delimiter=form.separator, newlines_in_values=True),
             pa_csv.ConvertOptions(column_types=form.schema, include_columns=columns, **cells),
-        ) as reader:
-            yield from reader
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path}{_told(path, form, first_line(error))}") from None
-
-
-def _told(path: Path, form: _Form, problem: str) -> str:
-    """An error of Arrow's, with line and column; it counts on from the lines before the first."""
-
-    def at(row: str | None) -> str:
-        return f", line {_line_of(path, form, int(row) - form.begin - 1)}" if row else ""
-
-    if found := _PROBLEM.fullmatch(problem):
-        return f"{at(found[2])}, column {form.schema.names[int(found[1])]!r}: {found[3]}"
-    if found := _SHORT.match(problem):
-        return f"{at(found[1])}: {found[2].lower()}"
-    return f" can't be read as rows of text: {problem}"
-
-
-def _line_of(path: Path, form: _Form, row: int) -> int:
-    """The line in which a row begins, from 1; empty lines are no rows."""
-    line = form.begin + 1
-    with path.open(encoding="utf-8-sig", newline=None, errors="replace") as file:
-        rows = csv.reader(islice(file, form.begin, None), delimiter=form.separator)
-        with suppress(csv.Error):
-            for cells in rows:
-                if cells and not row:
-                    break
-                row -= bool(cells)
-                line = form.begin + rows.line_num + 1
-    return line + row
+        ) as reader,
+    ):
+        yield from reader

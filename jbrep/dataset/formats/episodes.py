@@ -44,12 +44,6 @@ def cut(
 
     An episode ends where it is terminated or truncated, before another number of an episode or,
     without these, a step 0; where time goes back, or nothing comes for too long; and at the end.
-
-    Args:
-        name: of the source.
-        chunks: of rows, in order.
-        layout: which says how.
-        counts: of what was done, for the report.
     """
     begun, known, number, usual = list[Rows](), set[int](), None, None
     most = MOST_RAW if layout.rate or layout.length else MAX_EPISODE_STEPS
@@ -94,7 +88,6 @@ def _begins(
     usual: float | None,
     counts: Counts,
 ) -> NDArray[np.bool_]:
-    """Whether an episode begins at each row."""
     begins, last = np.zeros(len(rows["action"]), bool), before or _some(rows, 0, 1)
     for flag in {*ENDS} & rows.keys():
         if not np.isin(rows[flag], (0, 1)).all():
@@ -135,12 +128,8 @@ def episode_of(where: str, rows: Rows, once: Mapping[str, Any]) -> Incoming | No
 
     Without the observation after its last action, the last step is left out, so that the
     observation before that becomes the final one: nothing is made up. What ended the episode came
-    after it, so the episode counts as truncated then.
-
-    Args:
-        where: it is, for messages.
-        rows: of its steps.
-        once: its final observation, how it ended and its seed, where they are known.
+    after it, so the episode counts as truncated then. Its final observation, how it ended and its
+    seed may be known once.
     """
     observation, numbers = rows["observation"], np.arange(len(rows["action"]))
     for step in np.flatnonzero(rows.get("step", numbers) != numbers)[:1]:
@@ -203,10 +192,8 @@ def count_missing(episode: Incoming) -> int:
 def without_missing(episode: Incoming, missing: str) -> Iterator[Incoming]:
     """An episode in which all numbers are finite, or the parts of it that are.
 
-    Args:
-        episode: of n steps.
-        missing: skip leaves out the steps that aren't whole, and divides the episode there; hold:3
-            has the last number instead, for at most 3 steps in a row; empty if there must be none.
+    Skip leaves out the steps that aren't whole, and divides the episode there; hold:3 has the last
+    number instead, for at most 3 steps in a row.
     """
     count = count_missing(episode) if missing else 0
     episode = episode._replace(missing=count)

@@ -122,7 +122,6 @@ def write(dataset: Dataset, out: Path) -> str:
 
 
 def _columns(dataset: Dataset, begin: int, end: int, fps: float) -> dict[str, Array]:
-    """Some rows, by LeRobot's names."""
     rows = slice(begin, end)
     wide = {_STATE: dataset["observation"][rows], "action": dataset["action"][rows]}
     rewards = {"next.reward": dataset["reward"][rows]} if "reward" in dataset.columns else {}

@@ -98,7 +98,6 @@ def read(given: str) -> Frame:
 
 
 def _folder(given: str) -> Path:
-    """The folder with a data set's metadata."""
     root = Path(os.environ.get(_ROOT) or Path.home() / ".minari" / "datasets")
     for folder in (Path(given), Path(given) / "data", root / given / "data"):
         if exists(folder / _METADATA):

@@ -5,7 +5,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +28,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line, refusing
 from jbrep.progress import Progress
 from jbrep.records.record import from_plain
-from jbrep.records.storage import (
-    exists,
-    publish,
-    taken,
-    unfinished,
-    write_whole,
-)
+from jbrep.records.storage import exists, publish, unfinished
 
 _SETTINGS = b"jbrep"  # of the data set, in the metadata of a table that was exported
 
@@ -91,31 +84,18 @@ def _exported(path: Path, schema: pa.Schema, settings: bytes) -> dict[str, Any]:
 
 
 def _beside(path: Path) -> Path:
-    """The file of episodes."""
     return path.with_stem(f"{path.stem}-episodes")
 
 
 def write(dataset: Dataset, out: Path) -> str:
-    """Write a file of steps, and beside it one of episodes; returns how to open them.
-
-    The latter comes first, and may be there from an export of the same that was killed.
-    """
-    with unfinished(out) as partial:
-        beside, episodes = _beside(out), BytesIO()
+    """Write a file of steps, and beside it one of episodes; returns how to open them."""
+    with unfinished(out) as partial, unfinished(_beside(out)) as episodes:
         columns = {name: list(values) for name, values in dataset.episodes.items()}
         pq.write_table(pa.table(columns), episodes, write_page_checksum=True)
-        is_there = exists(beside)
-        if is_there and beside.read_bytes() != episodes.getvalue():
-            raise taken(beside)
         _write_steps(dataset, partial, out.name)
-        write_whole(beside, episodes.getvalue())
-        try:
-            publish(partial, out)
-        except BaseException:
-            if not is_there:
-                beside.unlink()
-            raise
-    return f"pandas.read_parquet({str(out)!r}), and {beside.name} for the episodes"
+        publish(episodes, _beside(out))
+        publish(partial, out)
+    return f"pandas.read_parquet({str(out)!r}), and {_beside(out).name} for the episodes"
 
 
 def _write_steps(dataset: Dataset, path: Path, name: str) -> None:

@@ -58,8 +58,10 @@ def roles_of(frame: Frame, layout: Layout) -> Roles:
     taken = {*own.values()} | {each.name for some in roles.values() for each in some}
     others = [each for each in leaves if not {each.name, each.column} & taken]
     others = [each for each in others if not _NOT_FEATURES.fullmatch(each.column)]
-    others = _matching(frame, leaves, frame.task.feature_names) if frame.task else others
-    seen = roles.setdefault("observation", others)
+    if "observation" not in roles:
+        own_features = frame.task and _matching(frame, leaves, frame.task.feature_names)
+        roles["observation"] = own_features or others
+    seen = roles["observation"]
     angles = {*_matching(frame, seen, layout.angles, "observation")}
     roles["observation"] = [each._replace(is_angle=each in angles) for each in seen]
     if layout.observations:
@@ -99,7 +101,6 @@ def _leaves(frame: Frame, column: pa.Field) -> Iterator[Leaf]:
 
 
 def _said(layout: Layout) -> dict[str, tuple[str, ...]]:
-    """The names of columns that a layout says, by what they are."""
     once = {role: getattr(layout, role) for role in ("time", "episode", "terminated", "reward")}
     said = {role: (name,) for role, name in once.items() if name}
     wide = {"action": layout.actions, "observation": layout.observations}

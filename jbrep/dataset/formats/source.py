@@ -37,10 +37,7 @@ _LAST = ("row", "after the last action of an episode, or alone: no step begins t
 class Source:
     """Reads the rows of a frame as episodes, and counts what it does to them.
 
-    Args:
-        frame: to read.
-        given: what the user says of its columns, before what its format says.
-        missing: what becomes of numbers that are missing, see `without_missing`.
+    What the user says of its columns comes before what its format says.
 
     Attributes:
         name: for messages and provenance.
@@ -126,7 +123,6 @@ class Source:
         return np.where(self._angles, wrapped(turned), turned) if self._angles.any() else seen
 
     def _rows(self) -> Iterator[Rows]:
-        """The rows by role, some at a time."""
         first, origin, labels = 0, None, dict[Any, int]()
         for batch in self.frame.batches(self._columns):
             if not batch.num_rows:
@@ -153,7 +149,6 @@ class Source:
             yield rows
 
     def _check_late(self) -> None:
-        """Refuse what came up too late, if it was asked for."""
         asked = (*self._layout.observations, *self._layout.actions)
         for name, problem in self.frame.late.items():
             if any(fnmatchcase(name, pattern) for pattern in asked):
@@ -248,5 +243,4 @@ def _exact(column: pa.Array) -> pa.Array:
 
 
 def _part(numbers: Array, leaf: Leaf) -> Array:
-    """What a leaf has of its column."""
     return numbers if leaf.place is None else numbers[:, leaf.place]

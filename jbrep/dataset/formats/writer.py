@@ -1,4 +1,4 @@
-"""Writing a data set of episodes that were made elsewhere: one pass to see them, one to write."""
+"""Writing a data set of what was made elsewhere: one pass to see the episodes, one to write."""
 
 import warnings
 from collections import Counter
@@ -11,15 +11,26 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
+from jbrep.dataset.formats import open_sources
+from jbrep.dataset.formats.arrays import frame_in_python
 from jbrep.dataset.formats.clock import same_clock
 from jbrep.dataset.formats.episodes import Incoming, count_missing, single, without_missing
+from jbrep.dataset.formats.frame import frame_of_table
 from jbrep.dataset.formats.source import Source
-from jbrep.dataset.manifest import Manifest, commit, new_manifest, write_manifest
+from jbrep.dataset.layout import Layout
+from jbrep.dataset.manifest import (
+    Manifest,
+    commit,
+    new_manifest,
+    range_problems,
+    write_manifest,
+)
+from jbrep.dataset.reader import Dataset
 from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
 from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
-from jbrep.dataset.verify import range_problems
-from jbrep.envs.description import with_features
+from jbrep.envs.description import as_task, with_features
+from jbrep.envs.names import is_code
 from jbrep.envs.probe import Signals, precision_problems
 from jbrep.envs.task import Missing, Task
 from jbrep.errors import InputError, Notice, kind_and_line
@@ -36,12 +47,102 @@ Rewards = Callable[[Array, Array], Array]
 
 
 class _Survey(NamedTuple):
-    """What all episodes are like."""
-
     lengths: list[int]
     low: Array  # of the actions, (k,)
     high: Array
     signals: Signals
+
+
+def from_arrays(
+    folder: str | Path,
+    observations: Any,
+    actions: Any,
+    rewards: Any,
+    terminations: Any,
+    truncations: Any = None,
+    *,
+    final_observations: Any = None,
+    seeds: Any = None,
+    task: Task | str | None = None,
+    source: str = "arrays",
+) -> Dataset:
+    """Write a data set of arrays of n episodes, one after the other, or of lists with one of each.
+
+    Args:
+        folder: new.
+        observations: before each action, (N, d); in a list, with or without the final one.
+        actions: (N, k).
+        rewards: (N,); None where none are known.
+        terminations: whether a state ended the episode at that step, (N,).
+        truncations: whether anything else did, such as a time limit, (N,).
+        final_observations: after the last action of each episode, (n, d). Where they aren't known,
+            the last step of each episode is left out, so that its observation is the final one.
+        seeds: that the episodes were started with, (n,); -1 where one isn't known.
+        task: that they are of, or its name; made from the data alone if not given.
+        source: where they come from, a few words; also the id of a task made from the data.
+    """
+    columns = {"observation": observations, "action": actions, "reward": rewards}
+    columns |= {"terminated": terminations, "truncated": truncations}
+    once = {"final_observation": final_observations, "seed": seeds}
+    return _written(folder, Source(frame_in_python(columns, once, source)), task)
+
+
+def from_table(
+    folder: str | Path,
+    table: Any,
+    layout: Layout | None = None,
+    *,
+    missing: str = "",
+    task: Task | str | None = None,
+    source: str = "table",
+) -> Dataset:
+    """Write a data set of a table's rows, such as a robot's log.
+
+    Args:
+        folder: new.
+        table: a frame of pandas or polars, a table of pyarrow's, or a dict of columns.
+        layout: what its columns are, and what becomes of its rows.
+        missing: what becomes of numbers that are missing: skip, or hold:3 and the like.
+        task: that the rows are of, or its name; made from the data alone if not given.
+        source: where they come from, a few words; also the id of a task made from the data.
+    """
+    opened = Source(frame_of_table(table, source), layout, missing)
+    return _written(folder, opened, task, layout, missing)
+
+
+def from_file(
+    folder: str | Path,
+    file: str | Path,
+    *more: str | Path,
+    layout: Layout | None = None,
+    missing: str = "",
+    task: Task | str | None = None,
+) -> Dataset:
+    """Write a data set of others' files, as `jbrep data import` does.
+
+    Args:
+        folder: new.
+        file: a log, or a data set of another tool, see docs/logs.md.
+        more: such files; an episode ends with each.
+        layout: as of `from_table`.
+        missing: likewise.
+        task: likewise; by default the one that the files name, if they do.
+    """
+    opened = open_sources([*map(str, (file, *more))], layout, missing)
+    return _written(folder, opened, task, layout, missing)
+
+
+def _written(
+    folder: str | Path,
+    source: Source,
+    task: Task | str | None,
+    layout: Layout | None = None,
+    missing: str = "",
+) -> Dataset:
+    reward = layout.reward if layout and is_code(layout.reward) else ""
+    known = None if task is None else as_task(task)
+    write(source, Path(folder), known, missing=missing, reward=reward)
+    return Dataset(folder)
 
 
 def write(
@@ -60,11 +161,8 @@ def write(
         task: that they are of; by default the one that the source names, or else one that is made
             from the data alone.
         features: a TOML file of what else is known of the features, as `describe` takes it.
-        missing: what becomes of numbers that aren't finite, see `without_missing`; by default as
-            the task says.
-        reward: code, as module:function, that gives rewards in place of the source's, (n,), of the
-            observations (n, d) and actions (n, k) of an episode, as the data set has them: without
-            the offsets of features.
+        missing: as `without_missing` takes it; by default as the task says.
+        reward: code, see `reward_function`, in place of the source's rewards.
     """
     missing = converted(missing, Missing, "missing") if missing else (task and task.missing) or ""
     if task:
@@ -76,7 +174,7 @@ def write(
             task = task or source.task
             fitting = _fitting(source, survey, task) if task else _from_data(source, survey)
             fitting = with_features(fitting, features) if features else fitting
-            given = survey.signals.plus(source.subtracted)
+            given = Signals(*(ends + source.subtracted for ends in survey.signals))
             for problem in precision_problems(fitting, given):
                 warnings.warn(problem, Notice, stacklevel=2)
             fitting = fitting.replace(missing=missing) if missing else fitting
@@ -120,8 +218,8 @@ def _survey(source: Source, missing: str) -> _Survey:
         for whole in source.episodes():
             counts.update(missing=count_missing(whole), left=len(whole.action), cut=whole.is_cut)
             for episode in without_missing(whole, missing):
-                seen = Signals.of([episode.observation])
-                signals = signals.with_more(seen) if signals else seen
+                seen = Signals.of(episode.observation)
+                signals = signals.joined(seen) if signals else seen
                 action = single(episode.where, "action", episode.action)
                 low, high = np.minimum(low, action.min(0)), np.maximum(high, action.max(0))
                 lengths.append(len(action))

@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from jbrep.progress import Progress
-from jbrep.records.lock import exclusive
-from jbrep.records.storage import make_folder, write_whole
+from jbrep.records.storage import exclusive, make_folder, write_whole
 from jbrep.records.tables import csv_text
 from jbrep.stats.runs import LARGEST_RETURN
 
