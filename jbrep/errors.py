@@ -11,6 +11,7 @@ _Choice = TypeVar("_Choice")
 _MOST_NAMES = 20
 _MOST_SHOWN = 3  # settings that differ
 _MOST_LETTERS = 40  # of a value
+_MOST = 500  # letters of a stranger's message
 
 
 class InputError(ValueError):
@@ -33,9 +34,17 @@ class StoppedError(Exception):
         self.step = step
 
 
+class StoppedProcess(SystemExit):
+    """Ctrl-C or SIGTERM ends this process."""
+
+
 def first_line(error: BaseException) -> str:
-    """The first line of an error's message; the name of its class where it has none."""
-    return str(error).strip().partition("\n")[0] or type(error).__name__
+    """The first line of an error's message, not too long; its class where it has none."""
+    try:
+        line = str(error).strip().partition("\n")[0]
+    except Exception:  # in a stranger's `__str__`
+        line = ""
+    return (line if len(line) <= _MOST else f"{line[:_MOST]}...") or type(error).__name__
 
 
 def kind_and_line(error: BaseException) -> str:

@@ -101,9 +101,7 @@ def test_a_line_of_units_tabs_and_dates(tmp_path):
 
 def test_missing_cells_are_cut_or_held_and_counted(tmp_path):
     path = write_csv(tmp_path / "a.csv", csv_rows(gyro=dict.fromkeys((30, 31), "")))
-    assert "a.csv, row 31 below the names: 'gyro' is empty" in not_imported(
-        path, *NAMED, "--gap", "1"
-    )
+    assert "a.csv, line 32: 'gyro' is empty" in not_imported(path, *NAMED, "--gap", "1")
     told, data = imported(path, *NAMED, "--gap", "1", "--missing", "skip")
     assert data.episodes["length"].tolist() == [29, 27, 59]
     assert "2 missing readings (skip): 3 steps left out" in " ".join(told.split())
@@ -303,10 +301,10 @@ def test_data_without_rewards_go_through_what_needs_none(tmp_path):
 BAD = {  # words of the line that refuses it: the place, and the column or option
     "Row #6 1,5.2": ({"gyro": {4: '"1,5.2"'}}, NAMED),
     "Row #9 6 7": ({"status": {7: "a,b"}}, NAMED),
-    "row 3 time": ({"time": {2: ""}}, (*NAMED, "--missing", "skip")),
-    "row 6 u": ({"u": {5: "inf"}}, NAMED),
+    "line 4 time": ({"time": {2: ""}}, (*NAMED, "--missing", "skip")),
+    "line 7 u": ({"u": {5: "inf"}}, NAMED),
     "column speed pitch": ({}, (*NAMED[:1], "speed", *NAMED[2:])),
-    "row 1 status": ({}, ("--actions", "u", "--time", "time")),
+    "line 2 status": ({}, ("--actions", "u", "--time", "time")),
     "--time --episode --length": ({}, NAMED[:4]),
     "--gap --time": ({}, (*NAMED[:4], "--gap", "1")),
     "time days ms": ({}, (*NAMED, "--units", "time=days")),
@@ -593,7 +591,7 @@ def test_small_things_of_logs(tmp_path):
     assert data["observation"][0].tolist() == [1, 2]
     assert data.task.action_low[0] < 3e7 < data.task.action_high[0]
     path.write_text("t,a,u\n0,1,1\n,2,2\n")
-    with pytest.raises(InputError, match=r"row 2 below the names: 't'"):
+    with pytest.raises(InputError, match=r"line 3: 't'"):
         from_file(tmp_path / "d", path, layout=named, missing="skip")
     with pytest.raises(InputError, match=r"has no actions: .*; it has t, a, u$"):
         from_file(tmp_path / "e", path, layout=Layout(time="t"))
@@ -735,7 +733,7 @@ def test_whole_numbers_that_floats_do_not_hold_are_refused(tmp_path):
         from_table(tmp_path / "a", table, layout)
     table["x"] -= 1
     path = write_csv(tmp_path / "a.csv", {name: each.tolist() for name, each in table.items()})
-    with pytest.raises(InputError, match=r"a\.csv, row 3.*'x'.*9007199254740993"):
+    with pytest.raises(InputError, match=r"a\.csv, line 4.*'x'.*9007199254740993"):
         from_file(tmp_path / "b", path, layout=layout)
     table["x"] = pandas.array([5, None, *table["x"][2:]], dtype="Int64")
     with pytest.raises(InputError, match=r"row 2.*'x'.*9007199254740993"):
@@ -764,7 +762,7 @@ def test_empty_lines_are_no_rows(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("# a\n\nt,x,u\n0,1,2\n\n1,2,3\n2,,3\n")
     told = not_imported(path, "--time", "t", "--actions", "u")
-    assert "a.csv, row 3 below the names: 'x' is empty" in told
+    assert "a.csv, line 4: 'x' is empty" in told
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TypeVar, cast
 
 import click
@@ -37,6 +37,33 @@ class _Mistake(click.ClickException):
 
     def __init__(self, message: str):
         super().__init__(printable(message))
+
+
+@contextmanager
+def _own_output() -> Iterator[None]:
+    """Keep standard output for jbrep: what an environment's C code prints there is an error's."""
+    try:
+        is_usual = (sys.stdout.fileno(), sys.stderr.fileno()) == (1, 2)
+    except (AttributeError, OSError, ValueError):
+        is_usual = False
+    if not is_usual:
+        yield
+        return
+    before, sys_before, kept = sys.stdout, sys.__stdout__, os.dup(1)
+    before.flush()
+    os.dup2(2, 1)
+    own = os.fdopen(kept, "w", encoding=before.encoding, errors=before.errors)
+    own.reconfigure(line_buffering=own.isatty())
+    sys.stdout = sys.__stdout__ = own  # type: ignore[misc]
+    try:
+        yield
+    finally:
+        with suppress(OSError, ValueError):  # such as a pipe that nobody reads
+            own.flush()
+        os.dup2(kept, 1)
+        sys.stdout, sys.__stdout__ = before, sys_before  # type: ignore[misc]
+        with suppress(OSError, ValueError):
+            own.close()
 
 
 @contextmanager
@@ -81,7 +108,7 @@ class _Cli(click.Group):
         self.format_commands(ctx, formatter)
 
     def main(self, *args: Any, **options: Any) -> Any:
-        with _notices(), _closing():
+        with _own_output(), _notices(), _closing():
             return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> None:

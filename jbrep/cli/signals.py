@@ -12,13 +12,15 @@ from typing import NoReturn
 
 import click
 
+from jbrep.errors import StoppedProcess
+
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 
 
 def leave(number: int, frame: FrameType | None) -> NoReturn:
     """End the process as the signal would, with what is to be done at its end."""
-    raise SystemExit(128 + number)
+    raise StoppedProcess(128 + number)
 
 
 @contextmanager

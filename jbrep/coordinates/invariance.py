@@ -10,7 +10,8 @@ from gymnasium.spaces.utils import flatten
 
 from jbrep.coordinates.coordinates import Coordinates
 from jbrep.coordinates.made import Ingredient, System, make_coordinates
-from jbrep.envs.make import action_in, aside, make_env
+from jbrep.envs.aside import aside
+from jbrep.envs.make import action_in, make_env
 from jbrep.envs.names import spec_of
 from jbrep.envs.physics import quarter_turn
 from jbrep.envs.task import Array, Task

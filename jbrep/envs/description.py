@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from msgspec.structs import asdict
 
+from jbrep.envs.aside import aside
 from jbrep.envs.domain import PHYSICS, SIGNALS, Domain, read_ranges
 from jbrep.envs.lanes import Lanes
-from jbrep.envs.make import aside, creator, give_back, is_batched, take
+from jbrep.envs.make import creator, give_back, is_batched, take
 from jbrep.envs.names import absolute, code_of, files_of, find_spec, spec_of
 from jbrep.envs.physics import can_be_pushed, physics_of
 from jbrep.envs.probe import Signals, precision_problems, probe

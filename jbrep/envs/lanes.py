@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jbrep.envs.aside import OURS, aside
 from jbrep.envs.disturbed import Disturbed
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
 from jbrep.envs.make import (
     action_in,
-    aside,
     discard,
     flattener,
     give_back,
@@ -321,7 +321,9 @@ class Separate:
                 with aside():
                     observation, info = self.envs[lane].reset(seed=seed)
                 return self._put(lane, observation, info)
-            except Exception as error:
+            except OURS:
+                raise
+            except BaseException as error:
                 self._handle_failure(lane, error)
 
     def step(self, actions: Array) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
@@ -330,14 +332,16 @@ class Separate:
         self._reward, self.lost = np.zeros(len(chosen)), np.zeros(len(chosen), np.bool_)
         single = actions.astype(np.float32)
         terminated, truncated = np.zeros((2, len(chosen)), np.bool_)
-        with aside():
+        with aside(in_episode=True):
             for lane in np.flatnonzero(chosen).tolist():
                 self._steps[lane] += 1
                 try:
                     terminated[lane], truncated[lane] = self._step(lane, single[lane])
                 except _MissingError:
                     self._lose(lane)
-                except Exception as error:
+                except OURS:
+                    raise
+                except BaseException as error:
                     self._handle_failure(lane, error)
                     self._lose(lane)
                     self.failed[lane] = True
@@ -412,7 +416,7 @@ class Separate:
         self.lost[lane], self._reward[lane] = True, 0.0
         self._steps[lane] -= 1
 
-    def _handle_failure(self, lane: int, error: Exception) -> None:
+    def _handle_failure(self, lane: int, error: BaseException) -> None:
         """Go on after a failure, unless there were too many, with a new instance."""
         if self.envs[lane] is not None:
             discard(self.envs[lane])

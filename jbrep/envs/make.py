@@ -7,10 +7,9 @@ end, whatever happens.
 
 import atexit
 import logging
-import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -22,6 +21,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
+from jbrep.envs.aside import aside
 from jbrep.envs.disturbed import Varied
 from jbrep.envs.domain import Domain
 from jbrep.envs.names import files_of, find_spec, spec_of
@@ -112,11 +112,6 @@ def of_size(flat: NDArray[Any], size: int) -> NDArray[Any]:
     if flat.shape != (size,):
         raise ValueError(f"it gave an observation of {flat.size} numbers instead of {size}")
     return flat
-
-
-def aside() -> redirect_stdout[Any]:
-    """What an environment prints goes to standard error: the output is the command's own."""
-    return redirect_stdout(sys.stderr)
 
 
 def number(value: Any, what: str) -> float:

@@ -3,15 +3,19 @@
 Each message is a row that has the numbers of its topic only, at the time when it was recorded.
 """
 
+import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_typestore
 
 from jbrep.dataset.formats.frame import CHUNK, Frame, check_plain, label_of
@@ -31,8 +35,8 @@ def read(given: str) -> Frame:
     path, columns, unknown, late = Path(given), dict[str, None](), list[str](), dict[str, str]()
     with _opened(path) as reader:
         for topic in sorted(reader.topics):
-            messages = islice(_messages(reader, {topic}), _PEEKED)
-            known = dict.fromkeys(name for each in messages for name in each if name != _TIME)
+            names = (name for each in _first(reader, topic) for name in each if name != _TIME)
+            known = dict.fromkeys(names)
             columns |= known
             unknown += [] if known else [topic]
 
@@ -80,14 +84,74 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         yield reader
 
 
+def _first(reader: AnyReader, topic: str) -> Iterator[_Numbers]:
+    """The numbers of a topic's first messages."""
+    connections = [each for each in reader.connections if each.topic == topic]
+    for message in islice(reader.messages(connections), _PEEKED):
+        yield _read(reader, *message)
+
+
 def _messages(reader: AnyReader, topics: set[str]) -> Iterator[_Numbers]:
-    connections = [each for each in reader.connections if each.topic in topics]
-    for connection, time, raw in reader.messages(connections) if connections else ():
-        try:
-            message = reader.deserialize(raw, connection.msgtype)
-        except KeyError:  # a type that nobody defines
-            message = None
-        yield {_TIME: time, **dict(_numbers(message, connection.topic, 0))}
+    """The numbers of messages of some topics, by their times.
+
+    Where the recorder's clock was set back, they are those before that, then those after it.
+    """
+    connections, clocks = [c for c in reader.connections if c.topic in topics], _clocks(reader)
+    for clock in range(1 + max(map(max, clocks.values()), default=-1)):
+        own = {topic: iter(each) for topic, each in clocks.items()}
+        for message in reader.messages(connections):
+            if next(own[message[0].topic]) == clock:
+                yield _read(reader, *message)
+
+
+def _read(reader: AnyReader, connection: Any, time: int, raw: bytes) -> _Numbers:
+    try:
+        message = reader.deserialize(raw, connection.msgtype)
+    except KeyError:  # a type that nobody defines
+        message = None
+    return {_TIME: time, **dict(_numbers(message, connection.topic, 0))}
+
+
+def _clocks(reader: AnyReader) -> dict[str, list[int]]:
+    """Of a topic's messages, by their times: how often the clock had been set back before each.
+
+    A topic's own messages are written in order, so that one with an earlier time has another clock;
+    those of several topics may be a little out of order.
+    """
+    latest, count, found = dict[str, int](), 0, dict[str, list[tuple[int, int]]]()
+    for topic, time in _recorded(reader):
+        if time < latest.get(topic, time):
+            latest, count = {}, count + 1
+        latest[topic] = time
+        found.setdefault(topic, []).append((time, count))
+    return {
+        topic: [clock for _, clock in sorted(some, key=itemgetter(0))]
+        for topic, some in found.items()
+    }
+
+
+def _recorded(reader: AnyReader) -> Iterator[tuple[str, int]]:
+    """Topic and time [ns] of each message, as they were written, whatever the clock said."""
+    for each in reader.readers:
+        if isinstance(each, Reader1):
+            topics = {connection.id: connection.topic for connection in each.connections}
+            index = [
+                (*entry[1:], entry[0], topics[k])
+                for k, some in each.indexes.items()
+                for entry in some
+            ]
+            yield from ((topic, time) for *_, time, topic in sorted(index))
+            continue
+        for storage in getattr(each.storage, "storages", [each.storage]):
+            if isinstance(storage, McapReader):
+                scan = storage.messages_scan(storage.connections)
+                yield from ((connection.topic, time) for connection, time, _ in scan)
+                continue
+            with closing(sqlite3.connect(storage.path)) as database:
+                yield from database.execute(
+                    "SELECT name, timestamp FROM messages JOIN topics ON topics.id = topic_id "
+                    "ORDER BY messages.id"
+                )
 
 
 def _numbers(value: Any, name: str, depth: int) -> Iterator[tuple[str, Any]]:

@@ -105,7 +105,7 @@ def _signal(
     """A column on the clock; NaN where it has no reading, or they are too far away."""
     some, step = np.isfinite(values), 1 / (layout.rate or 1.0)
     time, values, slack = time[some], values[some], _SLACK * step
-    own = None if is_linear else timestep_of(time)
+    own = None if is_linear else timestep_of(np.diff(time))
     late = max(slack, _LATE * min(step, own)) if own else slack
     last = np.searchsorted(time, grid + late, side="right") - 1
     age = grid - time[last]
@@ -125,9 +125,8 @@ def same_clock(one: float | None, other: float | None) -> bool:
     return not (one and other) or math.isclose(one, other, rel_tol=_ALIKE)
 
 
-def timestep_of(time: Array) -> float | None:
-    """From row to row [s], if the clock is even."""
-    steps = np.diff(time)
+def timestep_of(steps: Array) -> float | None:
+    """The step of a clock [s] by those from row to row, if it is even."""
     steps = steps[steps > 0]
     if not len(steps):
         return None

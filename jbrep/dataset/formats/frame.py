@@ -139,6 +139,9 @@ def frame_of_table(given: Any, name: str) -> Frame:
     """A frame of pandas or polars, or whatever else Arrow takes."""
     with refusing(f"{name} isn't a table", (TypeError, ValueError, pa.ArrowException)):
         table = pa.table(dict(given) if isinstance(given, Mapping) else given).combine_chunks()
+        for i, each in enumerate(table.schema):
+            if pa.types.is_dictionary(each.type):
+                table = table.set_column(i, each.name, _words(table.column(i)))
     schema = measured(table.schema, next(iter(table.slice(0, PEEKED).to_batches()), None))
     return Frame(
         name=name,
@@ -148,3 +151,12 @@ def frame_of_table(given: Any, name: str) -> Frame:
         rows=table.num_rows,
         about=units_in(schema),
     )
+
+
+def _words(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """A column of categories as its words; polars has them in a type that Arrow can't take from."""
+    chunks = [
+        pa.DictionaryArray.from_arrays(each.indices, each.dictionary.cast(pa.string()))
+        for each in column.chunks
+    ]
+    return pa.chunked_array([each.dictionary_decode() for each in chunks], pa.string())

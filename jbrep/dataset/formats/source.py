@@ -71,7 +71,7 @@ class Source:
         self.subtracted = self._factors * [each.subtracted for each in seen]
         self._second = second_of(frame.name, self._roles["time"][0]) if self._layout.time else 1.0
         first = next(self._rows(), None) if self._layout.time else None
-        self._clock = None if first is None else timestep_of(first["time"])
+        self._clock = None if first is None else timestep_of(_steps(first, self._layout.gap))
         self.timestep = 1 / rate if rate else frame.timestep or self._clock
 
     def join(self, *others: "Source") -> None:
@@ -227,6 +227,15 @@ def _both(frame: Frame, given: Layout) -> Layout:
         needed = "give --rate, --observations and --actions, of"
         raise InputError(f"{frame.name} has topics with clocks of their own: {needed} {names}")
     return layout
+
+
+def _steps(rows: Rows, gap: float | None) -> Array:
+    """From row to row within an episode [s], of the first rows."""
+    steps = np.diff(rows["time"])
+    within = steps <= (gap or np.inf)
+    if "episode" in rows:
+        within &= np.diff(rows["episode"]) == 0
+    return steps[within]
 
 
 def _exact(column: pa.Array) -> pa.Array:

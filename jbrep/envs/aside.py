@@ -1,0 +1,155 @@
+"""What an environment does to its process, it does to itself alone.
+
+An environment may change the working directory, torch's default type, the filters of warnings and
+all else that a process has once. It finds it again as it left it, and jbrep as it was.
+"""
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout, suppress
+from functools import cache
+from io import TextIOBase
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jbrep.errors import StoppedProcess, kind_and_line
+
+
+class _Global(NamedTuple):
+    """Something that a process has once."""
+
+    get: Callable[[], Any]  # it as plain data, which can be compared
+    put: Callable[[Any], object]
+
+
+def _directory() -> str | None:
+    with suppress(OSError):  # it may be deleted
+        return str(Path.cwd())
+    return None
+
+
+def _put_directory(path: str | None) -> None:
+    if path is not None:
+        os.chdir(path)
+
+
+def _put_variables(variables: dict[bytes, bytes]) -> None:
+    there = os.environb
+    for name in there.keys() - variables.keys():
+        del there[name]
+    there.update(variables)
+
+
+def _put_filters(filters: list[Any]) -> None:
+    warnings.filters[:] = filters  # type: ignore[index]
+    warnings._filters_mutated()  # type: ignore[attr-defined]
+
+
+def _put_interrupt(handler: Any) -> None:
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handler)
+
+
+_GENERATOR: Any = np.random.mtrand._rand._bit_generator  # NumPy's global one
+_STATE_BYTES = 2500  # of MT19937: 624 words, and the place among them
+
+
+def _numpy_state() -> bytes:
+    """Cheaply read: NumPy makes a dictionary of it."""
+    return ctypes.string_at(_GENERATOR.ctypes.state_address, _STATE_BYTES)
+
+
+def _put_numpy_state(state: bytes) -> None:
+    ctypes.memmove(_GENERATOR.ctypes.state_address, state, _STATE_BYTES)
+
+
+_SLOW = {
+    "variables": _Global(lambda: dict(os.environb), _put_variables),
+    "what Ctrl-C does": _Global(lambda: signal.getsignal(signal.SIGINT), _put_interrupt),
+}
+_QUICK = {
+    "the working directory": _Global(_directory, _put_directory),
+    "filters of warnings": _Global(lambda: [*warnings.filters], _put_filters),
+    "NumPy's errors": _Global(np.geterr, lambda how: np.seterr(**how)),
+    "NumPy's generator": _Global(_numpy_state, _put_numpy_state),
+    "the limit of recursion": _Global(sys.getrecursionlimit, sys.setrecursionlimit),
+}
+
+
+@cache
+def _of_torch(torch: Any) -> dict[str, _Global]:
+    if not hasattr(torch, "get_rng_state"):  # it isn't imported, or only just so
+        return {}
+    return {
+        "torch's type": _Global(torch.get_default_dtype, torch.set_default_dtype),
+        "torch's gradients": _Global(torch.is_grad_enabled, torch.set_grad_enabled),
+        "torch's threads": _Global(torch.get_num_threads, torch.set_num_threads),
+        "torch's generator": _Global(
+            lambda: torch.get_rng_state().numpy().tobytes(),
+            lambda state: torch.set_rng_state(
+                torch.frombuffer(bytearray(state), dtype=torch.uint8)
+            ),
+        ),
+    }
+
+
+class _ToErrors(TextIOBase):
+    """Standard error, which an environment can't close."""
+
+    def write(self, text: str) -> int:
+        return sys.stderr.write(text) if sys.stderr else len(text)
+
+    def flush(self) -> None:
+        if sys.stderr:
+            sys.stderr.flush()
+
+    def close(self) -> None:
+        """Leave it open."""
+
+
+OURS = (KeyboardInterrupt, StoppedProcess)  # which no environment raises
+_OUTPUT = _ToErrors()
+_theirs: dict[str, Any] = {}  # what environments have changed, as they left it
+_inside = False
+
+
+@contextmanager
+def aside(in_episode: bool = False) -> Iterator[None]:
+    """Let an environment do what it does: what it changes is put back, what it prints is an error.
+
+    Args:
+        in_episode: whether it is stepped, where what is slow to look at waits for the next episode.
+
+    Raises:
+        RuntimeError: it wants to end the process, or the like, in place of what it raised.
+    """
+    global _inside
+    if _inside:
+        yield
+        return
+    every = _QUICK | ({} if in_episode else _SLOW) | _of_torch(sys.modules.get("torch"))
+    ours = {name: each.get() for name, each in every.items()}
+    for name in _theirs.keys() & every.keys():
+        every[name].put(_theirs[name])
+    _inside = True
+    try:
+        with redirect_stdout(_OUTPUT):
+            yield
+    except (Exception, *OURS):
+        raise
+    except BaseException as error:
+        raise RuntimeError(f"it raised {kind_and_line(error)}") from error
+    finally:
+        _inside = False
+        for name, each in every.items():
+            now = each.get()
+            if name in _theirs or now != ours[name]:
+                _theirs[name] = now
+                each.put(ours[name])
