@@ -23,8 +23,8 @@ COMMANDS = {
         *("--out", "out"),
     ),
     "evaluate-policy": ("evaluate-policy", "uniform", *TASK, "--episodes", "2", "--json"),
-    "render": ("render", "--policy", "uniform", *TASK, "--out", "out.gif"),
-    "inspect": ("inspect", "--policy", "uniform", *TASK, "--out", "out.rrd"),
+    "render": ("render", "uniform", *TASK, "--out", "out.gif"),
+    "inspect": ("inspect", "uniform", *TASK, "--out", "out.rrd"),
 }
 SECONDS = 60
 WHEN = ("make", "reset", "step")

@@ -38,10 +38,10 @@ def inspect(
 ) -> None:
     """Record an episode or encoder to see in Rerun.
 
-    SOURCE is a data set, a run, an encoder's file, or a policy such as
-    uniform, which needs a --task, as does an encoder by its name. An unfinished run plays its last
-    checkpoint. The robot is shown where MuJoCo simulates it; with an encoder, what is decoded is
-    shown beside what was observed, and for the Jitterbug the decoded robot beside the true one.
+    SOURCE is a data set, a run, an encoder's file, or a policy such as uniform, which needs a
+    --task, as does an encoder by its name. An unfinished run plays its last checkpoint. The robot
+    is shown where MuJoCo simulates it; with an encoder, what is decoded is shown beside what was
+    observed, and for the Jitterbug the decoded robot beside the true one.
 
     Args:
         episode: its number, from 0; 0 if not given.

@@ -100,6 +100,15 @@ def _of_torch(torch: Any) -> dict[str, _Global]:
     }
 
 
+def _open_output() -> None:
+    """Let no file of jbrep's get the number of an output that was closed."""
+    try:
+        os.fstat(1)
+    except OSError:
+        with suppress(OSError):
+            os.dup2(2, 1)
+
+
 class _ToErrors(TextIOBase):
     """Standard error, which an environment can't close."""
 
@@ -148,6 +157,7 @@ def aside(in_episode: bool = False) -> Iterator[None]:
         raise RuntimeError(f"it raised {kind_and_line(error)}") from error
     finally:
         _inside = False
+        _open_output()
         for name, each in every.items():
             now = each.get()
             if name in _theirs or now != ours[name]:

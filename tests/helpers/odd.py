@@ -1,5 +1,6 @@
 """Environments that do one thing that they shouldn't: when they are made, reset or stepped."""
 
+import contextlib
 import ctypes
 import decimal
 import gc
@@ -44,6 +45,11 @@ def _print_from_c():
     libc.fflush(None)
 
 
+def _close(descriptor):
+    with contextlib.suppress(OSError):
+        os.close(descriptor)
+
+
 def _child():
     process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(0,))
     process.start()
@@ -66,7 +72,7 @@ HARMLESS = {  # it is played as if nothing had happened
     "print": lambda: print("hello"),
     "print from C": _print_from_c,
     "output closed": lambda: sys.stdout.close(),
-    "descriptor closed": lambda: os.close(1),
+    "descriptor closed": lambda: _close(1),
     "Ctrl-C ignored": lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     "a thread": lambda: threading.Thread(target=time.sleep, args=(0.01,)).start(),
     "a child": _child,
