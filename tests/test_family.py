@@ -154,12 +154,6 @@ def test_weights_that_cannot_be_are_named(kind, settings, said, data, tmp_path):
         Fitter(data, tmp_path).plan(kind, latent=4, **settings)
 
 
-def test_weights_that_are_all_zero_are_refused(data, tmp_path):
-    nothing = dict.fromkeys(data.names, 0)
-    with pytest.raises(InputError, match="all weights of features are 0: give at least one above"):
-        Fitter(data, tmp_path).plan("vae", latent=4, weights=nothing)
-
-
 def test_the_authors_begin_with_normal_weights_and_shake_a_batch_as_one(data):
     preset = DAE.presets["authors"]
     used = DAE(latent=12, **preset)

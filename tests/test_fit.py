@@ -96,23 +96,6 @@ def test_scaling_is_fitted_on_the_training_part_only(data, tmp_path):
     assert (everything.max(axis=0) > encoder.scaler.high).any()
 
 
-def test_a_denoiser_beats_a_plain_autoencoder_from_noise_only(data, tmp_path):
-    fitter = Fitter(data, tmp_path)
-    training = {"epochs": 60, "batch_size": 100, "learning_rate": 3e-3}
-    plain = fitter.fit("ae", **how("ae", latent=8, **training)).encoder
-    denoising = fitter.fit("dae", **how(latent=8, noise=0.5, **training)).encoder
-    rows = data.dataset["observation"][data.test]
-    noise = np.random.default_rng(0).normal(size=rows.shape).astype(np.float32)
-    width = data.scaler.half_width
-
-    def error(encoder, strength):
-        back = encoder.decode(encoder.encode(rows + strength * noise * width))
-        return np.mean(((back - rows) / width) ** 2)
-
-    assert error(denoising, 0.5) < error(plain, 0.5)
-    assert error(plain, 0) < error(denoising, 0)
-
-
 @pytest.fixture(scope="module")
 def whole(data, tmp_path_factory):
     """The file of a training that nothing stopped."""

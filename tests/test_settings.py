@@ -397,12 +397,3 @@ def test_a_study_of_learners(tmp_path):
     with pytest.raises(InputError, match=r"holds another study: algorithms\.tuned"):
         Plan(read_study(path), out).write()
     assert (out / "study.json").read_bytes() == before
-
-
-def test_settings_are_not_mixed_under_a_label(tmp_path):
-    steps = {"steps": 5, "evaluation_episodes": 1, "final_episodes": 1}
-    for seed, gamma in enumerate((0.9, 0.9, 0.8)):
-        learner = Learner.given("a2c", "modern", {"gamma": gamma}, "mine")
-        train(Run(task=TASK, learner=learner, seed=seed, **steps), tmp_path / str(seed))
-    write_tables(tmp_path)
-    assert "other settings" in " ".join(read_tables(tmp_path).left_out)
