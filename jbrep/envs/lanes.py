@@ -355,6 +355,8 @@ class Separate:
         own = action_in(self._action_space, action)  # which the environment may change
         observation, reward, terminated, truncated, info = self.envs[lane].step(own)
         ends = number(terminated, "terminated"), number(truncated, "truncated")
+        if math.isnan(sum(ends)):
+            raise ValueError("it gave a terminated or truncated that is not a number")
         self._put(lane, observation, info, number(reward, "reward"), True)
         return bool(ends[0]), bool(ends[1])
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.errors import InputError, choose
+from jbrep.errors import InputError, choose, listed
 from jbrep.records.storage import exists
 
 if TYPE_CHECKING:
@@ -64,9 +64,18 @@ def open_sources(given: Sequence[str], layout: Layout | None = None, missing: st
     paths = [Path(each).resolve() for each in given]
     if twice := [each for each, path in zip(given, paths, strict=True) if paths.count(path) > 1]:
         raise InputError(f"{twice[-1]} is given twice: its episodes would be there twice")
+    before = _states(paths)
     first, *others = [Source(load_reader(each).read(each), layout, missing) for each in given]
     first.join(*others)
+    first.has_changed = lambda: _states(paths) != before
     return first
+
+
+def _states(paths: Sequence[Path]) -> list[tuple[Path, int, int]]:
+    """Files, their sizes and when they were changed."""
+    files = (each for path in paths for each in [path, *sorted(path.rglob("*"))] if each.exists())
+    states = ((each, each.stat()) for each in files)
+    return [(each, state.st_size, state.st_mtime_ns) for each, state in states]
 
 
 def load_reader(given: str) -> ModuleType:
@@ -82,5 +91,8 @@ def load_reader(given: str) -> ModuleType:
         raise InputError(f"{path} is a data set of jbrep's already: there is nothing to import")
     if not exists(path) and suffix in _FILES:
         raise InputError(f"there is no file {path}")
+    bags = [each.name for each in sorted(path.glob("*")) if each.suffix in (".mcap", ".db3")]
+    if bags and not exists(path / "metadata.yaml"):
+        raise InputError(f"{path} has no metadata.yaml: give its files themselves, {listed(bags)}")
     folders = (name for mark, name in _FOLDERS.items() if exists(path / mark))
     return import_module(f"{__name__}.{_FILES[suffix] if is_file else next(folders, 'minari')}")

@@ -1,7 +1,7 @@
 """Rows with times: parts of an episode on an even clock, or with a row for each time."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,26 +10,29 @@ from numpy.typing import NDArray
 from jbrep.coordinates import wrapped
 from jbrep.dataset.formats.episodes import MOST_RAW, Counts, Rows, stretches, usual_step
 from jbrep.dataset.formats.frame import ENDS
+from jbrep.dataset.formats.roles import Leaf
 from jbrep.dataset.layout import Layout
-from jbrep.errors import InputError
+from jbrep.errors import InputError, listed
 
 Array = NDArray[Any]
 
 _SLACK = 1e-6  # of a step, by which rounding may shift a time
 _LATE = 0.1  # of a step, by which a reading of an even clock may be late and count as on time
 _ALIKE = 0.01  # by which even clocks may differ and count as the same
+_MOST_GROWTH = 1000  # rows for each that was read, where they are more than so many:
+_MOST_SHORT = 1_000_000
+_MOST_NUMBERS = 50_000_000
+_MOST_PASSED = 0.2  # of readings that come no faster than rows
 _EVEN = 0.1  # by which most steps of an even clock may differ from the median
 
 
-def parts_of(
-    rows: Rows, layout: Layout, angles: NDArray[np.bool_], counts: Counts
-) -> Iterator[Rows]:
+def parts_of(rows: Rows, layout: Layout, leaves: Sequence[Leaf], counts: Counts) -> Iterator[Rows]:
     """The rows of an episode in parts that are whole and not too long, each row at its time.
 
-    Angles, (d,), are those numbers of an observation that jump by a full turn.
+    Leaves are those of observation, action and reward, in this order.
     """
     is_uneven = layout.rate is not None
-    for part in _resampled(rows, layout, angles, counts) if is_uneven else _once_each(rows, counts):
+    for part in _resampled(rows, layout, leaves, counts) if is_uneven else _once_each(rows, counts):
         steps = len(part["action"])
         length = layout.length or steps
         counts["cut", f"after {length} rows"] += (steps - 1) // length
@@ -49,19 +52,21 @@ def _once_each(rows: Rows, counts: Counts) -> Iterator[Rows]:
 
 
 def _resampled(
-    rows: Rows, layout: Layout, angles: NDArray[np.bool_], counts: Counts
+    rows: Rows, layout: Layout, leaves: Sequence[Leaf], counts: Counts
 ) -> Iterator[Rows]:
     """The rows on an even clock, from where each column has had a reading.
 
     Where it is known what was observed after the last action, the last step leads there.
     """
-    time, rate, size = rows["time"], layout.rate or 1.0, len(angles)
+    time, rate, size = rows["time"], layout.rate or 1.0, rows["observation"].shape[1]
     signals = [rows[name] for name in ("observation", "action", "reward") if name in rows]
     values = np.column_stack(signals)
     known = np.isfinite(values)
-    if not known.any(axis=0).all():
-        never = "of episodes in which a column has no reading: left out"
-        counts["row", never] += len(time)
+    if not (has_some := known.any(axis=0)).all():
+        silent = listed(
+            [leaf.name for leaf, some in zip(leaves, has_some, strict=True) if not some]
+        )
+        counts["row", f"of episodes without a reading of {silent}: left out"] += len(time)
         return
     begin = time[known.argmax(axis=0)].max()
     final: Any = rows.get("next_observation", [np.nan])[-1]
@@ -70,15 +75,19 @@ def _resampled(
         unknown = np.full(values.shape[1] - size, np.nan)
         values = np.vstack((values, np.append(final, unknown)))
         time = np.append(time, time[-1] + (usual_step(np.diff(time)) or 1 / rate))
-    length = (time[-1] - begin) * rate
+    with np.errstate(over="ignore"):
+        length = (time[-1] - begin) * rate
+    most = max(_MOST_GROWTH * len(time), _MOST_SHORT)
+    if not length <= min(most, _MOST_NUMBERS / values.shape[1], MOST_RAW):
+        raise InputError(
+            f"an episode of {len(time):,} rows lasts {time[-1] - begin:.6g} s, {length:,.6g} rows at "
+            f"{rate:g} Hz: correct its times, end it at pauses by --gap, or give a lower --rate"
+        )
     count = math.ceil(length - _LATE) if has_final else int(length + _SLACK) + 1
-    if count > MOST_RAW:
-        raise InputError(f"an episode has {count:,} steps at {rate:g} Hz: give a lower --rate")
     grid = begin + np.arange(count) / rate
     is_linear = layout.fill == "linear"
-    turning = [*angles.tolist(), *[False] * (values.shape[1] - size)]
     columns = [
-        _signal(grid, time, column, layout, is_linear and i < size, turning[i])
+        _signal(grid, time, column, layout, is_linear and i < size, leaves[i], counts)
         for i, column in enumerate(values.T)
     ]
     even = np.stack(columns, axis=1)
@@ -100,7 +109,13 @@ def _resampled(
 
 
 def _signal(
-    grid: Array, time: Array, values: Array, layout: Layout, is_linear: bool, is_turning: bool
+    grid: Array,
+    time: Array,
+    values: Array,
+    layout: Layout,
+    is_linear: bool,
+    leaf: Leaf,
+    counts: Counts,
 ) -> Array:
     """A column on the clock; NaN where it has no reading, or they are too far away."""
     some, step = np.isfinite(values), 1 / (layout.rate or 1.0)
@@ -112,10 +127,16 @@ def _signal(
     if is_linear:
         following = time[np.minimum(last + 1, len(time) - 1)]
         age = np.where(age > slack, np.maximum(age, following - time[last]), age)
-        even = np.interp(grid, time, np.unwrap(values) if is_turning else values)
-        even = wrapped(even) if is_turning else even
+        even = np.interp(grid, time, np.unwrap(values) if leaf.is_angle else values)
+        even = wrapped(even) if leaf.is_angle else even
     else:
         even = values[last].astype(float)
+        passed = len(time) - len(np.unique(last))
+        if len(time) <= len(grid) and passed > _MOST_PASSED * len(time):
+            bursts = (
+                f"of {leaf.name} in bursts shorter than a step, but for the last of each: left out"
+            )
+            counts["reading", f"{bursts}; a higher --rate keeps more"] += passed
     even[age > (layout.gap or np.inf) + slack] = np.nan
     return even
 

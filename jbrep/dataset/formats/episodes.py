@@ -19,6 +19,7 @@ Counts = Counter[tuple[str, str]]  # of what was done: what it was done to, and 
 
 MOST_RAW = 20_000_000  # rows of what is cut, or brought to another clock
 _PAUSE = 10  # usual steps
+_STAYS = "an episode of its own each; if the flag only stays true, keep its first row"
 _PAUSES = "ten times as long as the usual step or longer, within an episode: --gap ends it there"
 
 
@@ -93,7 +94,11 @@ def _begins(
         if not np.isin(rows[flag], (0, 1)).all():
             raise InputError(f"{name} has a {flag} that is neither true nor false, 0 nor 1")
         ended = last[flag][-1:] if before else [False]
-        begins |= np.concatenate((ended, rows[flag][:-1])).astype(bool)
+        after = np.concatenate((ended, rows[flag][:-1])).astype(bool)
+        counts["row", f"{flag} right after one that was: {_STAYS}"] += int(
+            (after & rows[flag].astype(bool)).sum()
+        )
+        begins |= after
     if "episode" in rows:
         begins |= np.diff(rows["episode"], prepend=last["episode"][-1:]) != 0
     elif "step" in rows:

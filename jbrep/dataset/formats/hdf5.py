@@ -60,7 +60,12 @@ def read(given: str) -> Frame:
             f"{given} has neither observations and actions, as D4RL's files do, nor data/demo_0 "
             "and so on with actions, as robomimic's"
         )
-    return frame_of_arrays(given, arrays, label=label_of(Path(given).stem), about=_about(arrays))
+    own = own_names(given, arrays)
+    is_told = own.keys() & {"truncated", "next_observation", "episode", "step"}
+    ends = "no timeouts and no next observations: episodes end where they are terminated alone; "
+    notes = () if is_told else (f"{ends}--length cuts those that a time limit ended",)
+    label = label_of(Path(given).stem)
+    return frame_of_arrays(given, arrays, label=label, about=_about(arrays), notes=notes)
 
 
 def _arrays(group: h5py.Group) -> dict[str, Array]:
@@ -79,9 +84,11 @@ def _frame_of_demos(name: str, demos: dict[str, dict[str, Array]], told: Any) ->
     early, episodes, after = 0, dict[str, dict[str, Array]](), dict[str, str]()
     for where, arrays in demos.items():
         steps = len(arrays["actions"])
-        ends = np.ravel(arrays.pop("dones", np.zeros(steps))) > 0
-        if len(ends) != steps:
-            raise InputError(f"{name}, {where} has {len(ends)} dones, and {steps} actions")
+        told_ends = np.ravel(arrays.pop("dones", np.zeros(steps)))
+        if len(told_ends) != steps or np.isnan(told_ends).any():
+            has = f"{name}, {where} has {len(told_ends)} dones, and {steps} actions"
+            raise InputError(f"{has}: there must be one for each, and none not a number")
+        ends = told_ends > 0
         early += int(ends[:-1].sum())
         after = after or {
             _column(each, arrays): _NEXT + each.removeprefix(_NOW)

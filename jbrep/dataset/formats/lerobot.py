@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jbrep.dataset.formats.arrays import column_of
+from jbrep.dataset.formats.clock import same_clock, timestep_of
 from jbrep.dataset.formats.frame import PEEKED, About, Frame, check_plain, label_of, measured, width
 from jbrep.dataset.formats.parquet import batches_of, reading
 from jbrep.dataset.layout import Layout
@@ -91,7 +92,22 @@ def read(given: str) -> Frame:
         unusable=dict.fromkeys(images, "images"),
         layout=Layout(observations=tuple(seen), actions=("action",)),
         timestep=1 / fps,
+        notes=_clock_notes(paths[0], schema, fps),
     )
+
+
+def _clock_notes(path: Path, schema: pa.Schema, fps: float) -> tuple[str, ...]:
+    """What to say where the first rows' own times contradict the rate."""
+    if "timestamp" not in schema.names:
+        return ()
+    with pq.ParquetFile(path) as file:
+        batch = next(file.iter_batches(PEEKED, columns=["timestamp"]), None)
+    times = np.array([] if batch is None else batch.column(0), np.float64)
+    step = timestep_of(np.diff(times))
+    if same_clock(step, 1 / fps):
+        return ()
+    clocks = f"timestamps are {step:.4g} s apart, and {INFO} says {fps:g} frames a second"
+    return (f"{clocks}, which is taken: --time timestamp takes the others",)
 
 
 def _names(column: pa.Field, feature: dict[str, Any]) -> tuple[str, ...]:

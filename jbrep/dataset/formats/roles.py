@@ -6,7 +6,9 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from jbrep.dataset.formats.frame import ALIASES, About, Frame, check_names, own_names, width
 from jbrep.dataset.layout import Layout
@@ -18,6 +20,9 @@ from jbrep.text import words
 WIDE = ("observation", "action", "next_observation")  # with many numbers a row
 DEGREES = ("deg", "°", "degrees", "degree")
 RADIANS = ("", "rad")
+MOST_RADIANS = 2 * math.pi + 0.01  # of an angle whose unit nobody says
+_TURNS = (2 * math.pi, 360.0)
+_IN_DEGREES = re.compile(r"[_. ]?deg(rees?)?$", re.IGNORECASE)
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}  # by unit
 _ACTION = re.compile(r"actions?(_\d+)?")
 _NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
@@ -149,6 +154,9 @@ def features_of(name: str, leaves: list[Leaf]) -> tuple[Feature, ...]:
             known = each.feature or Feature(name=word)
             features.append(known.replace(name=word, unit=each.unit[:40]))
         elif each.unit in (*RADIANS, *DEGREES):
+            if _IN_DEGREES.search(each.short):
+                check_radians(name, each)
+                word = _IN_DEGREES.sub("", word) or word  # it is in radians now
             angle = Feature(name=word, unit="rad", low=-pi, high=pi, bounded=True, kind="angle")
             features.append(angle)
         else:
@@ -156,6 +164,38 @@ def features_of(name: str, leaves: list[Leaf]) -> tuple[Feature, ...]:
                 f"{name} has the angle {each.name!r} in {each.unit!r}: give rad or deg"
             )
     return tuple(features)
+
+
+def check_radians(name: str, leaf: Leaf) -> None:
+    """Refuse an angle that is beyond a turn, or called degrees, unless its unit is said."""
+    if leaf.is_angle and leaf.unit not in (*DEGREES, "rad"):
+        raise InputError(
+            f"{name} has the angle {leaf.name!r} without a unit, and it looks like degrees: give "
+            f"--units {leaf.name}=deg, or {leaf.name}=rad"
+        )
+
+
+class Turns:
+    """Finds numbers that jump by a full turn, as angles do."""
+
+    def __init__(self) -> None:
+        self._low, self._high = np.array(np.inf), np.array(-np.inf)
+        self._jump = np.array(0.0)
+
+    def see(self, values: NDArray[np.float64]) -> None:
+        """Look at consecutive rows, (n, d)."""
+        jump = np.abs(np.diff(values, axis=0)).max(axis=0, initial=0)
+        self._jump = np.fmax(self._jump, jump)
+        self._low = np.fmin(self._low, values.min(axis=0))
+        self._high = np.fmax(self._high, values.max(axis=0))
+
+    def found(self) -> list[float]:
+        """The turn of each number, (d,); 0 where there is none."""
+        width, jump = np.atleast_1d(self._high - self._low), np.atleast_1d(self._jump)
+        turns = np.zeros(len(width))
+        for turn in _TURNS:
+            turns[(width > 0.9 * turn) & (width <= 1.001 * turn) & (jump > 0.9 * turn)] = turn
+        return turns.tolist()
 
 
 def second_of(name: str, time: Leaf) -> float:

@@ -16,8 +16,11 @@ from jbrep.dataset.formats.episodes import Counts, Incoming, Rows, cut, episode_
 from jbrep.dataset.formats.frame import Frame, width
 from jbrep.dataset.formats.roles import (
     DEGREES,
+    MOST_RADIANS,
     WIDE,
     Leaf,
+    Turns,
+    check_radians,
     features_of,
     is_of_task,
     roles_of,
@@ -29,6 +32,7 @@ from jbrep.text import counted
 
 Array = NDArray[Any]
 
+_SIGNALS = ("observation", "action", "reward")
 _EXACT = ("time", "episode")  # of which no digit may be lost
 _ALIKE = ("task", "features", "has_rewards", "action_bounds", "subtracted")  # of several sources
 _LAST = ("row", "after the last action of an episode, or alone: no step begins there")
@@ -47,7 +51,10 @@ class Source:
         subtracted: offsets of features that observations lack already, (d,).
         timestep: from row to row [s], if that is known.
         rows: how many there are, if that is known.
+        has_changed: whether its files have, since they were opened.
     """
+
+    has_changed: Callable[[], bool] = staticmethod(lambda: False)
 
     def __init__(self, frame: Frame, given: Layout | None = None, missing: str = ""):
         self.frame, self._layout = frame, _both(frame, given or Layout())
@@ -58,6 +65,8 @@ class Source:
         self._columns = list(dict.fromkeys(column for _, column in used))
         self._numeric = {column for role, column in used if role not in _EXACT}
         seen, is_own = self._roles["observation"], is_of_task(frame, self._roles)
+        self._leaves = [leaf for role in _SIGNALS for leaf in self._roles.get(role, ())]
+        self._turns = Turns()
         self._angles = np.array([each.is_angle for each in seen])
         degrees = self._angles & np.array([each.unit in DEGREES for each in seen])
         self._factors = np.where(degrees, math.pi / 180, 1)  # of what is observed, (d,)
@@ -72,7 +81,8 @@ class Source:
         self._second = second_of(frame.name, self._roles["time"][0]) if self._layout.time else 1.0
         first = next(self._rows(), None) if self._layout.time else None
         self._clock = None if first is None else timestep_of(_steps(first, self._layout.gap))
-        self.timestep = 1 / rate if rate else frame.timestep or self._clock
+        own = self._clock if given and given.time else None  # what the user names comes first
+        self.timestep = 1 / rate if rate else own or frame.timestep or self._clock
 
     def join(self, *others: "Source") -> None:
         """Add the episodes of others, which must be alike."""
@@ -95,6 +105,7 @@ class Source:
     def episodes(self) -> Iterator[Incoming]:
         """The episodes, from the first on."""
         self._counts.clear()
+        self._turns = Turns()
         name, known, count = self.frame.name, {**self.frame.once}, 0
         final, seen = self.frame.final, self._roles["observation"]
         if final and {leaf.column for leaf in seen} <= final.keys():
@@ -103,12 +114,13 @@ class Source:
         for where, rows in cut(name, self._rows(), self._layout, self._counts):
             ends = {what: values[count] for what, values in known.items() if count < len(values)}
             seed = {"seed": ends.pop("seed")} if "seed" in ends else {}
-            parts = [*parts_of(rows, self._layout, self._angles, self._counts)]
+            parts = [*parts_of(rows, self._layout, self._leaves, self._counts)]
             for i, part in enumerate(parts):
                 once = (seed if i == 0 else {}) | (ends if i == len(parts) - 1 else {})
                 episode = episode_of(where, part, once)
                 self._counts[_LAST] += len(part["action"]) - (len(episode.action) if episode else 0)
                 if episode:
+                    self._turns.see(episode.observation)
                     yield episode
             count += 1
         for what, values in known.items():
@@ -119,6 +131,8 @@ class Source:
 
     def _turned(self, seen: Array) -> Array:
         """Observations (n, d) with their angles in [-pi, pi) rad."""
+        for i in np.flatnonzero(np.nanmax(np.abs(seen), axis=0, initial=0) > MOST_RADIANS):
+            check_radians(self.name, self._roles["observation"][i])
         turned = seen * self._factors
         return np.where(self._angles, wrapped(turned), turned) if self._angles.any() else seen
 
@@ -138,7 +152,7 @@ class Source:
                     self._check(role, rows[role], first)
             if "time" in rows:
                 origin = rows["time"][0] if origin is None else origin
-                rows["time"] = (rows["time"] - origin).astype(float) * self._second
+                rows["time"] = self._since(rows["time"], origin, first)
             if "episode" in rows and rows["episode"].dtype.kind != "i":
                 names = rows["episode"].tolist()
                 rows["episode"] = np.array([labels.setdefault(e, len(labels)) for e in names])
@@ -147,6 +161,13 @@ class Source:
             first += batch.num_rows
             self._counts["row", "read"] += batch.num_rows
             yield rows
+
+    def _since(self, times: Array, origin: Any, first: int) -> Array:
+        """Times since the first one [s]."""
+        if times.dtype.kind == "i" and np.abs(times.astype(float) - float(origin)).max() >= 2**63:
+            raise InputError(f"{self._at(first)}: times are further apart than 64 bits hold")
+        with np.errstate(over="ignore"):
+            return (times - origin).astype(float) * self._second
 
     def _check_late(self) -> None:
         asked = (*self._layout.observations, *self._layout.actions)
@@ -205,6 +226,13 @@ class Source:
             notes.append(f"not used: {listed(unused)}")
         if self._layout.time and not self._layout.rate and self._clock is None:
             notes.append("the clock is uneven: --rate brings the rows to an even one")
+        for leaf, turn in zip(self._roles["observation"], self._turns.found(), strict=False):
+            if turn and not leaf.is_angle:
+                unit = "deg" if turn > MOST_RADIANS else "rad"
+                notes.append(
+                    f"{leaf.name} jumps by a full turn, {turn:.4g}: if it is an angle, give --angles "
+                    f"{leaf.name} --units {leaf.name}={unit}"
+                )
         if angles := int(self._angles.sum()):
             degrees = int((self._factors != 1).sum())
             told = f"{counted(angles, 'angle')} brought to [-pi, pi) rad"

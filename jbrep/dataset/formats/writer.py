@@ -315,7 +315,7 @@ def _fill(
                 )
             manifest = commit(folder, manifest, columns)
             progress.update(len(columns["step"]))
-    if manifest.rows != settings.steps:
+    if manifest.rows != settings.steps or source.has_changed():
         raise InputError(f"{source.name} changed while it was imported: try again")
     return manifest
 
