@@ -1,31 +1,17 @@
 """A study of a task with negative returns, no floor and no solved return: Pendulum's, made up."""
 
-import json
-
 import numpy as np
 import pytest
-from made_up import drawn, found_of, label_of, returns_of
+from made_up import found_of
 
-from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError
-from jbrep.records.tables import write_csv
-from jbrep.report import write_report
-from jbrep.report.figures import study_plots, write
-from jbrep.report.findings import Findings
 from jbrep.report.report import results_text
-from jbrep.report.tables import read_tables
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.rules import Planned, Rules
-from jbrep.study.record import RECORD, RunFacts, RunsRecord
 
 TASK = "dm_control/pendulum-v0"
 STEPS = np.arange(0, 20_001, 2000)
 START = -1400.0  # the untrained policy's
-PENDULUM = Task(
-    **{"id": TASK, "name": TASK, "max_episode_steps": 1000, "timestep": 0.05},
-    features=tuple(map(Feature, ("cosine", "sine", "velocity"))),
-    **{"action_low": (-2.0,) * 6, "action_high": (2.0,) * 6},
-)
 WORST = -1612.0  # of any episode: one of pca-1, in the middle of training
 LEVELS = {  # where runs of each representation end, and how far apart
     "full": (-200, 8),
@@ -187,92 +173,4 @@ def test_returns_below_the_floor_are_refused():
 # figures
 
 
-@pytest.fixture(scope="module")
-def returns(runs):
-    return returns_of(runs)
-
-
-def label(name, task=PENDULUM):
-    latent = [(2, "tanh")] if name != "full" else []
-    return label_of(task, name, latent, [(3, "linear")] if latent else [])
-
-
-LABELS = {f"{TASK}/sac/{name}": label(name) for name in LEVELS}
-
-
-@pytest.fixture(scope="module")
-def plots(analysis, runs):
-    return {plot.name: plot for plot in study_plots(found_of(analysis, runs))}
-
-
-def test_axes_of_returns_are_those_of_the_data(plots, group):
-    finals = [value for label in group.labels for value in label.by_run["final_return"]]
-    lowest = {
-        "representations": min(min(label.curve.p10) for label in group.labels),
-        "final_return": min(finals),
-        "every_run": START - 100,
-    }
-    for name, low in lowest.items():
-        ends = drawn(plots[name]).axes[0].get_ylim()
-        assert low - 150 < ends[0] <= low + 100
-        assert ends[1] < 0
-    first, *_, last = group.profile_returns
-    assert first < min(finals) <= first + 50
-    assert last - 50 < max(finals) <= last
-    for label in group.labels:
-        assert label.profile.value[0] == 1
-        assert label.profile.value[-1] == 0
-
-
-def test_nothing_is_drawn_of_what_is_unknown(plots):
-    for plot in plots.values():
-        labels = {line.get_label() for axes in drawn(plot).axes for line in axes.lines}
-        assert not labels & {"solved", "hand-written"}
-
-
 # the report
-
-
-@pytest.fixture(scope="module")
-def folder(runs, returns, tmp_path_factory):
-    """The tables of the study, and its report."""
-    folder = tmp_path_factory.mktemp("report")
-    header = ("task", "algorithm", "representation", "seed", "step", "episode", "return")
-    sha256 = write_csv(folder / "returns.csv", header, returns)
-    RunsRecord(
-        **{"study": None, "registration": None, "missing": {}, "labels": LABELS},
-        tables={"returns.csv": sha256},
-        **{"versions": [{"jbrep": "0.2.0"}], "processors": ["a processor"]},
-        runs=[
-            RunFacts(
-                **{"label": run.label, "seed": run.seed, "reason": None, "seconds": 60.0},
-                **{"encoder": "0" * 64, "encoder_seed": None},
-                status="finished" if run.failed_at is None else "failed",
-                steps=run.total_steps if run.failed_at is None else run.failed_at,
-            )
-            for run in runs
-        ],
-    ).write(folder / RECORD)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jbrep.report.report.write", lambda plots, path: write(plots[:1], path))
-        write_report(Findings.of(read_tables(folder)), folder)
-    return folder
-
-
-def test_where_no_policy_is_known_nobody_is_said_to_have_learned(folder, group):
-    """Agents that end no higher than they began, or than the least return, surely haven't."""
-    assert [label.learnt for label in group.labels] == ["unclear"] * 4
-    text = (folder / "summary.md").read_text()
-    assert "No reference policies were played" in text
-    assert f"gains are over an untrained policy, {group.ends.blind:,.0f}" in text
-    levels = {"full": (-200, 8), "dae-2": (START - 100, 8)}
-    for floor in (None, -2000, -1e4):
-        runs = [RunCurve(**{**vars(run), "return_floor": floor}) for run in study(levels)]
-        assert [each.learnt for each in analyse(runs).groups[0].labels] == ["unclear", "no"]
-
-
-def test_the_report_says_what_failed_runs_count_as(folder):
-    text = (folder / "summary.md").read_text()
-    assert "counts as return -1,612 from then on, the worst that was seen" in text
-    found = json.loads((folder / "findings.json").read_text())
-    assert found["groups"][0]["agents"][0]["numbers"]["steps_to_solved"] == [None] * 3

@@ -12,7 +12,6 @@ import torch
 from command import jbrep, mistake, refused
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from judged import diagnostics
 from rerun.chunk import RrdReader
 from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
@@ -245,20 +244,6 @@ def test_code_is_a_class_or_a_function_that_makes_an_encoder_or_is_one(name):
     np.testing.assert_array_equal(find(name, TASK).encode(ROWS), ROWS[:, :2] / 2)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("no_such_module:Net", "can't import no_such_module: ModuleNotFoundError"),
-        ("nets.py:Net", "nets.py is a file"),
-        ("test_own:Net", "can't make the encoder test_own:Net: AttributeError"),
-        ("test_own:Spoilt", "can't make the encoder test_own:Spoilt: TypeError"),
-        ("test_own:ROWS", "ndarray has neither `encode` nor `transform`"),
-    ],
-)
-def test_code_that_makes_no_encoder(name, message):
-    assert message in mistake("encoder", "info", name, "--task", "Pendulum-v1")
-
-
 def test_code_is_shown_as_far_as_it_is_known_and_not_exported(tmp_path):
     told = jbrep("encoder", "info", "test_own:Whole", "--task", "Pendulum-v1").output
     assert told.startswith("Whole\n")
@@ -294,23 +279,6 @@ def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
     alone = evaluation.replace(encoders={n: own[n] for n in ("full", "half")})
     names = ["prediction_by_feature", "prediction_by_horizon"]
     assert [plot.name for plot in encoder_plots(alone)] == names
-
-
-def test_evaluate_takes_code(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "jbrep.evaluate.diagnosis._side_by_side",
-        lambda encoders, *given: ({name: diagnostics() for name in encoders}, {}),
-    )
-    monkeypatch.setattr("jbrep.report.figures.encoder_plots", lambda evaluation: [])
-    chosen = ("--encoder", "test_own:Half", "test_own:make_half", "dae-8")
-    command = ("evaluate", "--data", "data/sample/face_direction", "--out", tmp_path, *chosen)
-    told = jbrep(*command)
-    assert told.exit_code == 0, told.output
-    assert "Judged: test_own:Half, code; test_own:make_half, code; dae-8, shipped." in " ".join(
-        told.output.split()
-    )
-    assert "Perhaps not new to these episodes: test_own:Half, test_own:make_half" in told.output
-    assert "dae-8, shipped is given twice: leave one out" in mistake(*command, "dae-8")
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import shutil
 
 import numpy as np
 import pytest
-from command import jbrep
 from small import settings
 
 from jbrep.collect import collect
@@ -146,11 +145,3 @@ def assert_held(action):
     """An episode's actions change with each block, and in none."""
     changes = np.diff(action[:, 0]) != 0
     np.testing.assert_array_equal(changes, np.diff(BLOCKS) > 0)
-
-
-def test_a_repeat_out_of_range_is_refused_in_a_line(tmp_path):
-    common = ("rl", "--task", "face_direction", "--steps", 100, "--out", tmp_path / "run")
-    result = jbrep(*common, "--set", "action_repeat=0")
-    assert result.exit_code == 2
-    assert "action_repeat is 0" in " ".join(result.output.split())
-    assert not (tmp_path / "run").exists()

@@ -100,13 +100,6 @@ def test_neither_lanes_nor_threads_nor_extension_change_a_byte(data, runs, tmp_p
     assert set(Dataset(data).episodes["policy"].tolist()) == {0, 1}
 
 
-def test_a_mixture_that_names_a_run_first_goes_on(runs, tmp_path):
-    text = f"{runs / 'jb'}:0.5+uniform:0.5"
-    gather(text, tmp_path / "twice", steps=100)
-    gather(text, tmp_path / "twice")
-    assert contents(tmp_path / "twice") == contents(gather(text, tmp_path / "once"))
-
-
 def test_a_worker_makes_the_same_episodes(runs, tmp_path):
     """Of a network that gives actions in [-1, 1] for what has been normalised before."""
     chosen, actor = some(runs / "sledge", tmp_path, task=SLEDGE, store_state=False, steps=80)
