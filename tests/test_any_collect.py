@@ -101,15 +101,6 @@ def test_shards_of_episodes_that_may_end_early_are_started_together(tmp_path):
     assert not Growth(tmp_path, brief).wants(1)
 
 
-def test_another_division_into_shards_has_the_same_rows(sledges, tmp_path):
-    collect(some(shard_episodes=8), tmp_path / "wide", num_threads=1)
-    wide, narrow = Dataset(tmp_path / "wide"), Dataset(sledges)
-    for name in wide.columns:
-        np.testing.assert_array_equal(wide[name], narrow[name])
-    for name in wide.episodes:
-        np.testing.assert_array_equal(wide.episodes[name], narrow.episodes[name])
-
-
 def deadly(tmp_path, times):
     """A task whose environment kills its worker in an episode of the second shard."""
     arguments = {"log": str(tmp_path / "log"), "times": times}

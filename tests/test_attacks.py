@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 NAMES = (  # the quick ones; tools/attack.py without names attacks all
-    *("checkpoints of sac", "rl --from", "inspect", "import of parquet", "import of mcap"),
+    *("checkpoints of sac", "inspect", "import of parquet", "import of mcap"),
     *("encoder import", "registration"),
 )
 

@@ -7,19 +7,15 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from command import jbrep, mistake
 from gymnasium.envs.registration import EnvSpec
 
-from jbrep.collect import collect
 from jbrep.coordinates import INGREDIENTS, Coordinates, make_coordinates
 from jbrep.coordinates.coordinates import Part
 from jbrep.coordinates.formulas import FORMULAS
 from jbrep.coordinates.invariance import check_invariant
 from jbrep.coordinates.placing import continuous, nearest, placed
-from jbrep.dataset import DataSettings
 from jbrep.encoders import find
 from jbrep.envs.description import describe
-from jbrep.envs.physics import turned_quaternion
 from jbrep.envs.task import Feature
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError, Notice
@@ -137,19 +133,6 @@ def test_a_robot_is_put_back_where_it_stood(name):
     np.testing.assert_allclose(nearest(task, back, rows), rows, atol=1e-3)
 
 
-def test_the_angle_of_a_robot_that_is_put_back_is_in_its_range():
-    """Where it heads, along the x axis as symmetry has it, and as it stood."""
-    swimmer = describe("Swimmer-v5")
-    ends = {"low": -np.pi, "high": np.pi, "unit": "rad"}
-    bearing = Feature(name="bearing", kind="angle", frame="world", **ends)
-    task = swimmer.replace(features=(bearing, *swimmer.features[1:]))
-    rows = np.zeros((2, task.size))
-    rows[:, 0] = 2.0, -3.0
-    as_seen = np.zeros((2, task.size))
-    as_seen[:, 0] = 0.0
-    np.testing.assert_allclose(placed(task, as_seen, rows)[:, 0], rows[:, 0])
-
-
 def test_the_same_states_are_compared_in_the_nearest_numbers():
     task, rows = TASKS["face_direction"].plain, states(TASKS["face_direction"].plain)
     place, angle = task.groups["orientation"], task.feature_names.index("angle_to_target")
@@ -166,21 +149,6 @@ def test_the_same_states_are_compared_in_the_nearest_numbers():
     smooth = continuous(task, jumps)
     np.testing.assert_allclose(smooth[:, place], path[:, place], atol=1e-12)
     np.testing.assert_allclose(smooth[:, angle], turning, atol=1e-9)
-
-
-@pytest.mark.parametrize(("low", "high"), [(-5, -1), (-5, 0), (-1, 5)])
-def test_an_offset_is_soft_by_its_largest_end(low, high):
-    task = TASKS["move_to_position"].plain
-    features = tuple(
-        f.replace(low=float(low), high=float(high)) if f.name.startswith("target") else f
-        for f in task.features
-    )
-    (polar,) = (
-        part
-        for part in make_coordinates(task.replace(features=features), "coordinates").parts
-        if part.formula == "polar"
-    )
-    assert polar.soft == pytest.approx(0.05)
 
 
 def test_a_turned_robot_moves_alike_until_chaos_parts_them():
@@ -318,18 +286,6 @@ def test_a_group_that_cant_be(kinds, said):
         TASK.replace(features=features)
 
 
-@pytest.mark.parametrize(
-    ("system", "leave_out", "said"),
-    [
-        ("symmetry", ["body"], "body can't be left out of symmetry"),
-        ("angles", ["phases"], "nothing can be left out of angles"),
-    ],
-)
-def test_what_cant_be_left_out(system, leave_out, said):
-    with pytest.raises(InputError, match=said):
-        make_coordinates(TASK, system, leave_out)
-
-
 class Disc(gymnasium.Env):
     """Where a disc that turns is, and its goal; its reward is how near they are."""
 
@@ -458,12 +414,6 @@ def test_what_joints_mean_depends_on_how_they_stand_and_how_far_they_go(body, fi
     assert kinds(made(monkeypatch, bodies=body))[: len(first)] == first
 
 
-def test_where_episodes_end_is_tried(monkeypatch):
-    ended = "the end of the episode is 0 without a quarter turn and 1 after one"
-    with pytest.raises(InputError, match=ended):
-        check_invariant(make_coordinates(made(monkeypatch, far=0.4), "symmetry"))
-
-
 def test_rewards_that_are_all_the_same_tell_nothing_of_symmetry(monkeypatch):
     task = made(monkeypatch, reward=0.0)
     with pytest.warns(Notice, match="gave the reward 0 at every step at which symmetry was tried"):
@@ -480,24 +430,6 @@ def test_what_fails_while_symmetry_is_tried_is_said_in_one_line(monkeypatch, cap
     assert not capsys.readouterr().out
 
 
-def test_an_encoder_of_symmetry_needs_the_module_that_makes_its_robot(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("jbrep.envs.names._imported", [])
-    settings = DataSettings(task=made(monkeypatch), steps=150)
-    collect(settings, tmp_path / "data", num_threads=1)
-    monkeypatch.delitem(gymnasium.registry, "Made-v0")
-    (tmp_path / "its_robot.py").write_text(
-        "import gymnasium, test_coordinates\n"
-        "gymnasium.register('Made-v0', test_coordinates.Made, max_episode_steps=60)"
-    )
-    where = ("--data", tmp_path / "data", "--out", tmp_path / "encoders")
-    make = ("train-encoder", "--kind", "symmetry", *where)
-    assert "--import" in mistake(*make)
-    assert jbrep(*make, "--import", "its_robot").exit_code == 0
-    for command in (("train-dae", "--latent", 2), ("evaluate", "--encoder", "full")):
-        assert "can't import none" in mistake(*command, *where, "--import", "none")
-
-
 def test_a_task_whose_features_say_nothing():
     plain = TASK.replace(features=[each.replace(kind="scalar", frame="") for each in TASK.features])
     with pytest.raises(InputError, match="no features of which coordinates would be anything else"):
@@ -506,55 +438,12 @@ def test_a_task_whose_features_say_nothing():
         make_coordinates(plain, "symmetry")
 
 
-def test_parts_that_would_have_a_features_name_have_another():
-    """MuJoCo's users name the numbers of a velocity as a part of `body` does."""
-    names = {f"velocity_{axis}": f"velocity.{axis}" for axis in "xyz"}
-    named = tuple(each.replace(name=names.get(each.name, each.name)) for each in TASK.features)
-    rows = states(TASK)
-    for system in ("coordinates", "symmetry"):
-        usual, other = (
-            make_coordinates(TASK, system),
-            make_coordinates(TASK.replace(features=named), system),
-        )
-        assert "velocity.body.x" in other.names
-        np.testing.assert_array_equal(other.forward(rows), usual.forward(rows))
-        np.testing.assert_array_equal(other.forward(rows[0]), usual.forward(rows[0]))
-    spoiled = tuple(
-        each.replace(name="velocity") if each.name == "velocity.body" else each
-        for each in other.parts
-    )
-    with pytest.raises(InputError, match=r"velocity gives velocity\.x, which is a feature"):
-        Coordinates(TASK.replace(features=named), spoiled)
-
-
-@pytest.mark.parametrize(
-    ("hidden", "kinds"),
-    [
-        (["position_x"], {"scalar"}),
-        (["position_x", "position_y"], {"scalar"}),
-        (["position_z"], {"point"}),
-    ],
-)
-def test_what_is_left_of_a_vector_is_one_only_where_it_is_x_and_y(hidden, kinds):
-    seen = with_view(TASK, [*hidden, "orientation_w"])
-    assert {each.kind for each in seen.features if each.group == "position"} == kinds
-    assert {each.kind for each in seen.features if each.group == "orientation"} == {"scalar"}
-
-
 def test_an_angle_is_given_back_in_its_range():
     turning = Feature("knee", "rad", 0.0, 4.7, kind="angle")
     task = TASK.whole.replace(features=(turning, *TASK.features))
     coordinates = make_coordinates(task, "angles")
     rows = np.insert(states(TASK, 3), 0, (3.0, 3.2, 4.5), axis=1)
     np.testing.assert_allclose(coordinates.inverse(coordinates.forward(rows))[:, 0], rows[:, 0])
-
-
-def test_a_free_thing_beside_a_heavier_arm_is_no_robot(monkeypatch):
-    arm = '<body><joint axis="0 1 0"/><geom size=".2" density="9000"/><site name="s"/></body>'
-    task = made(monkeypatch, bodies=PUCK + arm)
-    assert "point" not in kinds(task)
-    with pytest.raises(InputError, match="no feature that says where its robot is"):
-        make_coordinates(task, "symmetry")
 
 
 def test_a_strangers_coordinates_are_checked():
@@ -572,8 +461,3 @@ def test_a_strangers_coordinates_are_checked():
     ):
         with pytest.raises(InputError, match=said):
             Coordinates(TASK, from_plain(spoiled, tuple[Part, ...]))
-
-
-def test_a_quarter_turn_is_one():
-    quaternion = turned_quaternion(np.array([[1.0, 0, 0, 0]]))
-    np.testing.assert_allclose(quaternion, [[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])

@@ -245,27 +245,6 @@ def test_a_shard_is_flat_columns_that_any_hdf5_tool_opens(collected):
         assert file["episodes/seed"][:].tolist() == [4 * 2**32 + 2]
 
 
-def test_mistakes_are_named(tmp_path):
-    for folder in (tmp_path, tmp_path / "none"):
-        with pytest.raises(InputError, match="no data set in"):
-            Dataset(folder)
-
-
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"task": 3}, "environment"),
-        ({"seed": -1}, "seed"),
-        ({"steps": 1.5}, "steps"),
-        ({"shard_episodes": None}, "shard_episodes"),
-        ({"store_state": "yes"}, "store_state"),
-    ],
-)
-def test_a_setting_that_can_t_be_is_named(change, field):
-    with pytest.raises(InputError, match=field):
-        settings(**change)
-
-
 @pytest.mark.parametrize("task", ["move_from_origin", "move_to_pose"])
 def test_the_samples_are_verified(task):
     told = jbrep("data", "verify", f"data/sample/{task}", "--replay", 1)

@@ -102,18 +102,6 @@ def test_many_robots_are_one_repeated_with_its_own_seed():
             np.testing.assert_array_equal(observation[lane], one[0])
 
 
-def test_many_robots_conform_to_their_spaces_and_work_under_wrappers():
-    many = gymnasium.make_vec(FACE, num_envs=2, max_episode_steps=5)
-    many = gymnasium.wrappers.vector.RecordEpisodeStatistics(many)
-    observation, _ = many.reset(seed=[3, 9])
-    total = np.zeros(2)
-    for _ in range(5):
-        assert observation in many.observation_space
-        observation, reward, _, _, info = many.step(many.action_space.sample())
-        total += reward
-    np.testing.assert_allclose(info["episode"]["r"], total, rtol=1e-5)
-
-
 def test_a_robot_that_diverges_is_truncated_and_flagged():
     environment = gymnasium.make(FACE)
     environment.reset(seed=0)

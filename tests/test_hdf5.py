@@ -30,19 +30,6 @@ def test_what_came_after_each_action_keeps_the_last_steps(tmp_path):
     assert few.episodes["final_observation"].tolist() == [[10], [8], [7]]
 
 
-def test_angles_are_brought_to_rad_after_each_action_too(tmp_path):
-    now = np.stack([40.0 * STEPS, np.repeat(range(3), (10, 8, 7))], 1).astype(np.float32)
-    after = now + np.array([40, 0], np.float32)
-    path = write_d4rl(tmp_path / "a.h5", observations=now, next_observations=after)
-    names = ("--observations", "observations.0", "--angles", "observations.0")
-    _, data = imported(path, *names, "--units", "observations=deg")
-    turned = np.radians(40 * np.arange(10))
-    np.testing.assert_allclose(
-        np.exp(1j * data["observation"][:10, 0]), np.exp(1j * turned), atol=1e-5
-    )
-    assert data.episodes["length"].tolist() == [10, 8, 7]
-
-
 def test_a_file_of_robomimic(tmp_path):
     told, data = imported(write_robomimic(tmp_path / "low_dim.hdf5"))
     assert (data.task.id, data.task.timestep) == ("Lift", 1 / 20)

@@ -79,22 +79,3 @@ def test_the_truth_is_of_the_same_motion_and_shows_more(swing, tmp_path, monkeyp
     settings = DataSettings(task=describe("Pendulum-v1"), steps=6000, seed=3)
     collect(settings, tmp_path / "other", num_threads=1)
     assert "has other actions than now: the truth must be" in mistake(*judge, tmp_path / "other")
-
-
-def test_a_time_limit_is_no_argument_of_an_environment(tmp_path):
-    given = ("--env", "max_episode_steps=50", "--steps", 200, "--out", tmp_path / "out")
-    told = mistake("collect", "--task", "Pendulum-v1", *given)
-    assert "Pendulum-v1: --episode-steps sets the time limit" in told
-
-
-def test_features_named_anew_are_judged_as_any_robot_s(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    order = describe("face_direction").feature_names
-    rows = [f'name = "{name.replace("orientation", "turn")}"' for name in order]
-    (tmp_path / "f.toml").write_text("".join(f"[[features]]\n{row}\n" for row in rows))
-    task = describe("face_direction", {}, 100, tmp_path / "f.toml")
-    collect(DataSettings(task=task, steps=1000, seed=2), tmp_path / "d", num_threads=1)
-    made = jbrep("train-encoder", "--kind", "pca", "--latent", 4, "--data", "d", "--out", "e")
-    assert made.exit_code == 0
-    told = jbrep("evaluate", "--encoder", "e/pca-4.safetensors", "--data", "d", "--out", "judged")
-    assert told.exit_code == 0, told.output

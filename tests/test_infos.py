@@ -108,17 +108,6 @@ def test_evaluate_policy_says_them(run):
     assert json.loads(jbrep(*command, "--json").stdout)["infos"] == expected
 
 
-def test_a_changed_table_is_refused(run, tmp_path):
-    folder, _ = run
-    for each in folder.iterdir():
-        if each.is_file():
-            (tmp_path / each.name).write_bytes(each.read_bytes())
-    flip_bit(tmp_path / INFOS, 300)
-    assert f"{INFOS} was changed after it was written" in refused(read_infos, tmp_path)
-    (tmp_path / INFOS).unlink()
-    assert "can't read" in refused(read_infos, tmp_path)
-
-
 def test_others_have_no_such_table(tmp_path):
     sledge = Run.of("Sledges/Sledge-v0", "a2c", steps=40, evaluation_episodes=1, final_episodes=1)
     result = train(sledge, tmp_path)
@@ -193,15 +182,3 @@ def test_shares_are_of_last_evaluations_and_have_intervals(study):
     }
     (agents,) = next(g for g in found.groups if g.task == SCORED).agents
     assert agents.shares["won"] == pytest.approx((0.5, 0.16, 0.84), abs=0.005)
-
-
-def test_a_run_is_reported_in_its_own_folder(run):
-    """Its own table stays what it was."""
-    folder, _ = run
-    before = (folder / INFOS).read_bytes()
-    done = jbrep("report", folder)
-    assert done.exit_code == 0, done.output
-    assert (folder / INFOS).read_bytes() == before
-    words = done.stdout.split()
-    assert "share of slid" in " ".join(words)
-    assert (words.count("0.50"), words.count("0.33")) == (1, 1)

@@ -17,12 +17,3 @@ def test_a_container_has_less_memory_than_its_machine(version, tmp_path, monkeyp
     monkeypatch.setattr(machine, "_CGROUP", tmp_path)
     assert machine.memory() == 256 << 20
     assert machine.free_memory() == 208 << 20
-
-
-def test_without_a_limit_there_is_all_that_the_machine_has(tmp_path, monkeypatch):
-    (tmp_path / "memory.max").write_text("max\n")
-    monkeypatch.setattr(machine, "_CGROUP", tmp_path)
-    monkeypatch.setattr(machine, "_MEMORY", tmp_path / "none")
-    sizes = {"SC_PHYS_PAGES": 1 << 22, "SC_PAGE_SIZE": 1 << 12}
-    monkeypatch.setattr("os.sysconf", sizes.__getitem__)
-    assert machine.free_memory() == machine.memory() == 1 << 34

@@ -2,27 +2,14 @@
 
 import numpy as np
 import pytest
-from made_up import label_of, returns_of
 
-from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError
-from jbrep.records.tables import write_csv
-from jbrep.report import write_report
-from jbrep.report.figures import write
-from jbrep.report.findings import Findings
-from jbrep.report.tables import read_tables
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.rules import Planned, Rules
-from jbrep.study.record import RECORD, RunFacts, RunsRecord
 
 TASK = "dm_control/pendulum-v0"
 STEPS = np.arange(0, 20_001, 2000)
 START = -1400.0  # the untrained policy's
-PENDULUM = Task(
-    **{"id": TASK, "name": TASK, "max_episode_steps": 1000, "timestep": 0.05},
-    features=tuple(map(Feature, ("cosine", "sine", "velocity"))),
-    **{"action_low": (-2.0,) * 6, "action_high": (2.0,) * 6},
-)
 WORST = -1612.0  # of any episode: one of pca-1, in the middle of training
 LEVELS = {  # where runs of each representation end, and how far apart
     "full": (-200, 8),
@@ -168,55 +155,4 @@ def test_returns_below_the_floor_are_refused():
 # figures
 
 
-@pytest.fixture(scope="module")
-def returns(runs):
-    return returns_of(runs)
-
-
-def label(name, task=PENDULUM):
-    latent = [(2, "tanh")] if name != "full" else []
-    return label_of(task, name, latent, [(3, "linear")] if latent else [])
-
-
-LABELS = {f"{TASK}/sac/{name}": label(name) for name in LEVELS}
-
-
 # the report
-
-
-@pytest.fixture(scope="module")
-def folder(runs, returns, tmp_path_factory):
-    """The tables of the study, and its report."""
-    folder = tmp_path_factory.mktemp("report")
-    header = ("task", "algorithm", "representation", "seed", "step", "episode", "return")
-    sha256 = write_csv(folder / "returns.csv", header, returns)
-    RunsRecord(
-        **{"study": None, "registration": None, "missing": {}, "labels": LABELS},
-        tables={"returns.csv": sha256},
-        **{"versions": [{"jbrep": "0.2.0"}], "processors": ["a processor"]},
-        runs=[
-            RunFacts(
-                **{"label": run.label, "seed": run.seed, "reason": None, "seconds": 60.0},
-                **{"encoder": "0" * 64, "encoder_seed": None},
-                status="finished" if run.failed_at is None else "failed",
-                steps=run.total_steps if run.failed_at is None else run.failed_at,
-            )
-            for run in runs
-        ],
-    ).write(folder / RECORD)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jbrep.report.report.write", lambda plots, path: write(plots[:1], path))
-        write_report(Findings.of(read_tables(folder)), folder)
-    return folder
-
-
-def test_where_no_policy_is_known_nobody_is_said_to_have_learned(folder, group):
-    """Agents that end no higher than they began, or than the least return, surely haven't."""
-    assert [label.learnt for label in group.labels] == ["unclear"] * 4
-    text = (folder / "summary.md").read_text()
-    assert "No reference policies were played" in text
-    assert f"gains are over an untrained policy, {group.ends.blind:,.0f}" in text
-    levels = {"full": (-200, 8), "dae-2": (START - 100, 8)}
-    for floor in (None, -2000, -1e4):
-        runs = [RunCurve(**{**vars(run), "return_floor": floor}) for run in study(levels)]
-        assert [each.learnt for each in analyse(runs).groups[0].labels] == ["unclear", "no"]

@@ -224,20 +224,6 @@ def test_code_is_a_class_or_a_function_that_makes_an_encoder_or_is_one(name):
     np.testing.assert_array_equal(find(name, TASK).encode(ROWS), ROWS[:, :2] / 2)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("no_such_module:Net", "can't import no_such_module: ModuleNotFoundError"),
-        ("nets.py:Net", "nets.py is a file"),
-        ("test_own:Net", "can't make the encoder test_own:Net: AttributeError"),
-        ("test_own:Spoilt", "can't make the encoder test_own:Spoilt: TypeError"),
-        ("test_own:ROWS", "ndarray has neither `encode` nor `transform`"),
-    ],
-)
-def test_code_that_makes_no_encoder(name, message):
-    assert message in mistake("encoder", "info", name, "--task", "Pendulum-v1")
-
-
 def test_code_is_shown_as_far_as_it_is_known_and_not_exported(tmp_path):
     told = jbrep("encoder", "info", "test_own:Whole", "--task", "Pendulum-v1").output
     assert told.startswith("Whole\n")

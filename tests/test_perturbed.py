@@ -1,7 +1,6 @@
 """What episodes draw: sensors, motors, bodies and physics, by their seeds alone."""
 
 import json
-import tomllib
 
 import gymnasium
 import mujoco
@@ -16,7 +15,7 @@ from jbrep.envs import Lanes, describe
 from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.description import with_domain
 from jbrep.envs.domain import Domain, Draws, read_ranges
-from jbrep.envs.physics import can_be_pushed, put_factors, velocity_after
+from jbrep.envs.physics import put_factors, velocity_after
 from jbrep.envs.view import with_view
 from jbrep.play.jitterbug import turn_targets
 from jbrep.play.perturbed import domains_of
@@ -29,9 +28,6 @@ from jbrep.rl.files import (
     read_evaluations,
     read_run,
 )
-from jbrep.study.config import as_study
-from jbrep.study.plan import Plan
-from jbrep.study.prepare import check
 
 TASKS = {
     "face_direction": describe("face_direction", {}, 12),
@@ -208,23 +204,6 @@ def test_a_push_gives_the_whole_robot_its_velocity():
     assert np.abs(added[-1]) > 0.01  # the leg swings
 
 
-@pytest.mark.parametrize(
-    ("link", "moves"),
-    [
-        ('axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"', True),
-        ('axis="0 1 0"/><geom type="capsule" fromto="-.3 0 0 .3 0 0" size=".02"', False),
-    ],
-)
-def test_a_push_on_a_robot_that_is_held_is_on_what_moves(link, moves):
-    """Unless that turns about its own centre of mass."""
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><body><geom size=".1" mass="5"/><body pos="0 0 .2">'
-        f"<joint {link}/></body></body></worldbody></mujoco>"
-    )
-    added = velocity_after(model, np.full(1, np.pi / 2), np.array([1, 0, 0]), mujoco.MjData(model))
-    assert can_be_pushed(model) == (np.abs(added).max() > 1) == moves
-
-
 def test_factors_are_of_the_model_s_friction_and_masses():
     usual, varied = (mujoco.MjModel.from_xml_string(LEGGED) for _ in range(2))
     data = mujoco.MjData(usual)
@@ -321,7 +300,6 @@ def test_a_robot_without_mujoco_has_the_rows_that_it_can_have():
 
 
 DRAWN = {**BODIES, "delay": "0..2", "noise": "0..0.2", "push": "0..0.5"}
-SHORT = "--steps 40 --evaluation-episodes 1 --final-episodes 1 --preset modern"
 SMALL = {"num_envs": 2, "net_arch": [8], "learning_starts": 20, "batch_size": 4}
 
 
@@ -365,46 +343,6 @@ def test_whoever_reads_a_run_knows_its_domain(runs):
     assert settings.differing(settings.replace(environment=plain)) == (
         "domain noise=0..0.2,delay=0..2,friction=0.5.... (now: none)"
     )
-
-
-def test_the_command_trains_with_ranges(tmp_path):
-    run = ("rl", "--task", "Pendulum-v1", "--episode-steps", 20, "--out", tmp_path / "run")
-    small = [word for n, v in SMALL.items() for word in ("--set", f"{n}={json.dumps(v)}")]
-    small += SHORT.split()
-    told = jbrep(*run, *small, "--domain", "delay=0..2", "--domain", "dropped=[0,0.5]")
-    assert told.exit_code == 0, told.output
-    domain = read_run(tmp_path / "run").settings.environment.domain
-    assert domain == Domain(delay=(0, 2), dropped=(0, 0.5))
-    assert "friction can't be changed in Pendulum-v1" in mistake(*run, "--domain", "friction=2")
-    assert "--domain delay isn't an argument" in mistake(*run, "--domain", "delay")
-    another = mistake(*run, *small)
-    assert "holds another run: domain delay=0..2,dropped=0..0.5 (now: none), encoder" in another
-
-
-def test_a_study_s_runs_draw_and_its_data_are_of_the_robot_as_it_is(tmp_path):
-    given = tomllib.loads(
-        """
-tasks = ["face_direction"]
-algorithms = ["sac-modern"]
-representations = ["full", "pca-4"]
-seeds = 1
-steps = 1000
-
-[domain]
-delay = "0..2"
-friction = [0.5, 1.5]
-
-[data]
-steps = 1000
-"""
-    )
-    plan = Plan(as_study(given), tmp_path)
-    again = as_study(tomllib.loads(plan.study.toml()))
-    assert again == plan.study
-    assert str(plan.run(plan.cells[0]).task.domain) == "delay=0..2,friction=0.5..1.5"
-    check(plan)  # also what it would collect
-    said = refused(as_study, {**given, "domain": {"wind": 3}})
-    assert "wind" in said
 
 
 def test_what_can_not_be_with_a_domain():

@@ -15,10 +15,10 @@ from PIL import Image
 
 from jbrep.envs import describe
 from jbrep.envs.make import make_env
-from jbrep.envs.physics import Motion, physics_of
+from jbrep.envs.physics import physics_of
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import plain_model
-from jbrep.play.film import Film, Pace, encode_gif, encode_mp4, get_format
+from jbrep.play.film import Film, Pace, encode_gif, encode_mp4
 from jbrep.play.pictures import Camera, add_caption, band_height, find_camera
 from jbrep.play.sources import find_episode
 
@@ -87,17 +87,6 @@ def test_a_gif_from_the_command_loops(tmp_path):
     assert (len(frames), frames[0].shape, loop) == (6, (64, 96, 3), 0)
     assert durations == [30, 40, 30, 30, 40, 30]  # as near to 1/30 s as a GIF counts
     assert not same(frames[0], frames[-1], 2)
-
-
-@needs_egl
-def test_side_by_side(tmp_path):
-    sources = ("uniform", "constant:drive=1")
-    told = render(*sources, "--task", "face_direction", "--out", tmp_path / "two.mp4")
-    assert "two.mp4: 192 x 64 pixels" in told.stdout
-    frames, _ = read_mp4(tmp_path / "two.mp4")
-    left, right = frames[-1][:, :94], frames[-1][:, 98:]
-    assert frames[-1].shape == (64, 192, 3)
-    assert not same(left, right, 2)
 
 
 @needs_egl
@@ -197,19 +186,6 @@ def test_speed_and_frames(pace, frames, last, episode, camera):
     assert film.seconds == pytest.approx(10 / pace.speed)
 
 
-@needs_egl
-def test_one_that_ends_before_the_others_stands_still(episode, camera):
-    arrays = {name: values[:21] for name, values in episode.motion.arrays.items()}
-    parts = {"observation": episode.observation[:21], "action": episode.action[:20]}
-    motion = Motion(episode.motion.model, arrays)
-    short = replace(episode, **parts, reward=episode.reward[:20], motion=motion)
-    film = Film([episode, short], camera, Pace(fps=5, seconds=1))
-    frames = [np.asarray(frame) for frame in film.frames()]
-    assert len(frames) == 5
-    assert same(frames[1][:, 98:], frames[4][:, 98:], 0.01)
-    assert not same(frames[1][:, :94], frames[4][:, :94], 1)
-
-
 def test_a_caption_keeps_to_its_band_and_to_its_room():
     for width, height in ((64, 64), (320, 240), (1280, 960)):
         picture = Image.new("RGB", (width, height), "green")
@@ -263,18 +239,6 @@ def test_a_mistake_is_one_line_and_exit_code_2(tmp_path, monkeypatch):
         assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "there.mp4"]
 
 
-@needs_egl
-def test_ctrl_c_leaves_no_file(tmp_path, monkeypatch):
-    import signal
-
-    from jbrep.play import film
-
-    monkeypatch.setattr(film, "add_caption", lambda *given: signal.raise_signal(signal.SIGINT))
-    stopped = render(SAMPLE, "--out", tmp_path / "a.mp4")
-    assert (stopped.exit_code, stopped.stderr) == (130, "stopped; no video was written\n")
-    assert not list(tmp_path.iterdir())
-
-
 def test_missing_opengl_is_one_line(tmp_path):
     """In a process of its own: MuJoCo looks for it once, when imported."""
     command = ("render", SAMPLE, "--out", str(tmp_path / "a.mp4"))
@@ -285,7 +249,3 @@ def test_missing_opengl_is_one_line(tmp_path):
     assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
     assert "EGL" in result.stderr
     assert not list(tmp_path.iterdir())
-
-
-def test_a_suffix_in_capitals():
-    assert get_format(Path("A.GIF")) == get_format(Path("a.gif"))

@@ -24,9 +24,7 @@ from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.make import make_env
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError
-from jbrep.rl import Run
 from jbrep.rl.files import read_run
-from jbrep.rl.run import estimate
 
 import_modules(["arms", "environments"])
 HOPPER = Path(gymnasium.__file__).parent / "envs/mujoco/assets/hopper.xml"
@@ -172,16 +170,6 @@ def test_a_clock_that_32_bits_swallow_is_told_and_shifted(tmp_path):
     assert jbrep("data", "verify", tmp_path / "e", "--replay", 1).exit_code == 0
 
 
-def test_a_range_is_of_what_an_offset_leaves(tmp_path):
-    path = tmp_path / "f.toml"
-    path.write_text(
-        "[[features]]\noffset = 0.5\n[[features]]\noffset = 5\nhigh = 2\n[[features]]\n"
-    )
-    given, task = describe("Pendulum-v1"), describe("Pendulum-v1", features=path)
-    assert [(each.low, each.high) for each in given.features] == [(-1, 1), (-1, 1), (-8, 8)]
-    assert [(each.low, each.high) for each in task.features] == [(-1.5, 0.5), (-6, 2), (-8, 8)]
-
-
 @pytest.mark.parametrize("made", [{"id": "Mine-v0"}, None])
 def test_a_class_describes_itself(made, monkeypatch):
     """As a task, and no other one."""
@@ -194,19 +182,6 @@ def test_a_class_describes_itself(made, monkeypatch):
     monkeypatch.setitem(gymnasium.registry, "Mine-v0", EnvSpec("Mine-v0", Mine))
     with pytest.raises(InputError, match="describe must return a jbrep"):
         describe("Mine-v0")
-
-
-@pytest.mark.parametrize("algorithm", ["sac", "a2c"])
-def test_an_estimate_is_of_steps_and_evaluations(algorithm, monkeypatch):
-    """Where whatever is timed takes 5 seconds: some steps of learning, or an evaluation."""
-    tried = []
-    monkeypatch.setattr("jbrep.rl.run._seconds", lambda work: (tried.append(work()), 5.0)[1])
-    task = describe("Pendulum-v1", max_episode_steps=20)
-    run = Run.of(task, algorithm, steps=4000, evaluate_every=500, final_episodes=15)
-    evaluations = 8 + 3  # the last has three times as many episodes
-    learned = estimate(run) - 5 * evaluations
-    per_step = learned / 4000
-    assert 5 / 700 < per_step <= 5 / 300
 
 
 # one robot, which fails
@@ -284,26 +259,6 @@ def test_what_fails_is_closed_kept_and_tried_again(tmp_path):
     assert closed(tmp_path)
 
 
-def test_a_robot_that_cannot_be_opened_at_once_again_is_tried_again(tmp_path, monkeypatch):
-    describe(arms.ID, {"log": str(tmp_path / "log")})
-    robot = arm(tmp_path, fails=[Arm.steps_of_all + 30])
-    busy, begin = iter([False, True]), Arm.__init__  # at first, and after the failure
-
-    def opened(self, *given, **named):
-        if next(busy, False):
-            raise OSError("port busy")
-        begin(self, *given, **named)
-
-    monkeypatch.setattr(Arm, "__init__", opened)
-    make.close_all()
-    Arm.steps_of_all = 0
-    told = jbrep(
-        "collect", *robot, "--steps", 100, "--threads", 1, "--retries", 2, "--out", tmp_path / "d"
-    )
-    assert told.exit_code == 0, told.output
-    assert len(Dataset(tmp_path / "d")) == 100
-
-
 def test_evaluations_and_training_go_on_after_failures(tmp_path):
     robot = arm(tmp_path, fails=[500, 620])
     policy = ("evaluate-policy", "uniform", *robot, "--episodes", 40, "--threads", 1, "--json")
@@ -367,43 +322,6 @@ def test_missing_readings_are_held_or_end_an_episode_and_counted(tmp_path):
     assert (told.exit_code, "missing" in told.output) == (2, True)
 
 
-def test_missing_readings_of_a_log(tmp_path):
-    """Held, or the episode is divided there; a clock is told of, and shifted."""
-    rows, log = 40, tmp_path / "log.npz"
-    angle = np.sin(np.arange(rows) / 5)
-    angle[[7, 30, 31]] = np.nan
-    ends = np.arange(rows) % 20 == 19
-    np.savez(
-        log,
-        observations=np.column_stack((1764000000 + 0.02 * np.arange(rows), angle)),
-        actions=np.ones((rows, 1)) * np.where(np.arange(rows) % 2, -1.0, 1.0)[:, None],
-        rewards=np.ones(rows),
-        terminations=ends,
-        truncations=np.zeros(rows, bool),
-    )
-    features = tmp_path / "features.toml"
-    features.write_text('[[features]]\nname = "clock"\noffset = 1764000000\n[[features]]\n')
-    command = ("data", "import", log, "--out", tmp_path / "data")
-    assert "isn't finite, or beyond 32 bits, at step 7" in mistake(*command)
-    told = mistake(*command, "--missing", "hold:1")
-    assert "feature 1 is missing at step 11, beyond hold:1 of the last one: hold it for" in told
-    told = jbrep(*command, "--missing", "hold:2")
-    assert "log.npz had 3 missing readings (hold:2)" in told.stderr
-    assert "obs_0 is from 1764000000" in told.stderr
-    held = Dataset(tmp_path / "data")
-    assert held.episodes["missing"].tolist() == [1, 2]
-    np.testing.assert_array_equal(held["obs_1"][6:8], np.float32(angle[[6, 6]]))
-    told = jbrep(*command[:-1], tmp_path / "cut", "--missing", "skip", "--features", features)
-    assert "3 missing readings (skip)" in told.stderr
-    assert "apart there" not in told.stderr
-    cut = Dataset(tmp_path / "cut")
-    assert cut.episodes["length"].tolist() == [6, 11, 9, 7]
-    assert cut.episodes["terminated"].tolist() == [0, 0, 0, 0]  # what follows an end isn't known
-    assert cut.episodes["missing"].tolist() == [1, 0, 2, 0]
-    np.testing.assert_allclose(cut["clock"][:3], [0, 0.02, 0.04], atol=1e-6)
-    assert not list(find_problems(tmp_path / "cut"))
-
-
 # what environments give
 
 
@@ -418,18 +336,6 @@ def test_a_reward_in_an_array_and_a_joint_that_can_t_move(tmp_path):
     assert (dataset["reward"][:] < 0).all()
     told = refused(describe, arms.ID, {"log": log, "reward": "pair"})
     assert "gave a reward of shape (2,): it must be one number" in told
-
-
-def test_an_environment_of_old_gym_is_refused():
-    class Old(gymnasium.Env):
-        observation_space = gymnasium.spaces.Box(-1, 1, (2,))
-        action_space = gymnasium.spaces.Box(-1, 1)
-
-        def reset(self, *, seed=None, options=None):
-            return np.zeros(2, np.float32)
-
-    gymnasium.register("Old/Env-v0", entry_point=Old, max_episode_steps=9)
-    assert "failed when it was tried" in refused(describe, "Old/Env-v0")
 
 
 def test_a_script_without_a_main_guard_collects_in_processes_if_they_can(tmp_path):

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jbrep.jitterbug.bodies import PUBLISHED, draw
+from jbrep.jitterbug.bodies import draw
 from jbrep.jitterbug.simulation import PHYSICS_STEPS, Simulation, plain_model
 from jbrep.jitterbug.tasks import get_task
 
@@ -109,15 +109,6 @@ def test_a_lane_s_model_has_its_friction_and_mass():
     assert_moves_like(simulation, models)
 
 
-def test_all_lanes_have_the_body_of_the_number():
-    simulation = with_bodies([4, 4], 7)
-    tape = drive(simulation)
-    np.testing.assert_array_equal(tape[:, 0], tape[:, 1])
-    np.testing.assert_array_equal(simulation.state["body"], [7, 7])
-    others = (drive(with_bodies([4], body)) for body in (8, None))
-    assert all(np.abs(tape[:, :1] - other).max() > 1e-3 for other in others)
-
-
 def test_a_random_body_is_the_episode_s_whatever_its_lane():
     whole = with_bodies(range(6), "random")
     numbers, tape = whole.state["body"], drive(whole)
@@ -164,16 +155,6 @@ def test_a_restored_simulation_continues_with_its_bodies(body):
         assert values.shape[0] == 3
         assert values.dtype == np.float64
     np.testing.assert_array_equal(drive(one), drive(other))
-
-
-def test_a_state_holds_bodies_only_where_there_are_others():
-    simulation = with_bodies(range(2), None)
-    assert "body" not in simulation.state
-    simulation.restore(**simulation.state, body=np.array([-1.0, 7.0]))
-    np.testing.assert_array_equal(simulation.state["body"], [PUBLISHED, 7])
-    simulation.reset([1], [np.random.default_rng(1)])
-    assert "body" not in simulation.state
-    np.testing.assert_array_equal(drive(simulation)[:, 1], drive(with_bodies([1], None))[:, 0])
 
 
 def test_a_lane_s_model_and_data_are_those_of_its_body():

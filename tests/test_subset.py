@@ -75,17 +75,6 @@ def test_noise_is_beside_all_features_and_unrelated_to_them_and_to_itself(data, 
     np.testing.assert_allclose(in_torch, latent, atol=2e-3)
 
 
-def test_seeds_give_different_controls(fit, observations):
-    for kind, latent in (("random", 4), ("noise", 20)):
-        codes = [
-            fit(kind, latent=latent, seed=seed, name=f"{kind}-s{seed}").encode(observations[:9])
-            for seed in (1, 2)
-        ]
-        again = fit(kind, latent=latent, seed=1, name=f"{kind}-again").encode(observations[:9])
-        assert np.abs(codes[0] - codes[1]).max() > 0.1
-        np.testing.assert_array_equal(codes[0], again)
-
-
 @pytest.mark.parametrize("scaling", ["extrema", "nominal", "standard"])
 def test_the_whole_is_scaled_as_its_name_says(data, fit, observations, scaling):
     encoder = fit("full", scaling=scaling)

@@ -150,19 +150,6 @@ def test_tilting_costs_reward(task):
     assert tilted == pytest.approx(0.1)
 
 
-def test_nominal_ranges():
-    ranges = {f.name: (f.low, f.high, f.unit) for t in TASKS.values() for f in t.plain.features}
-    assert ranges["position_x"] == (-2, 2, "m")
-    assert ranges["position_z"] == (0, 0.1, "m")
-    assert ranges["orientation_w"] == (-1, 1, "1")
-    assert ranges["velocity_z"] == (-1, 1, "m/s")
-    assert ranges["angular_velocity_y"] == (-35, 35, "rad/s")
-    assert ranges["motor_angle"] == ranges["angle_to_target"] == (-np.pi, np.pi, "rad")
-    assert ranges["motor_velocity"] == (-180, 180, "rad/s")
-    assert ranges["target_y"] == (-3, 3, "m")
-    assert ranges["target_z"] == (-0.1, 0.1, "m")
-
-
 def starts(task, count=2000, seed=0):
     random = np.random.default_rng(seed)
     return [

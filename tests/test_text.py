@@ -31,10 +31,6 @@ def test_any_names_become_different_words():
     ]
 
 
-def test_a_number_that_makes_a_word_different_may_be_taken():
-    assert words(["a_2", "a", "a", "a"]) == ["a_2", "a", "a_3", "a_4"]
-
-
 def test_a_curve_goes_from_the_least_to_the_largest():
     assert sparkline([3, 10, 6.5, float("inf")], 5) == "▁█▅"
     assert sparkline([0, 2, 8, 8, 7], 2) == "▁█"  # means of 1 and 7.67

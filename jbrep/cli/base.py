@@ -93,7 +93,7 @@ def _closing() -> Iterator[None]:
     try:
         yield
     finally:
-        if instances := sys.modules.get("jbrep.envs.instances"):  # only if there may be any
+        if instances := sys.modules.get("jbrep.envs.make"):  # only if there may be any
             instances.close_all()
 
 

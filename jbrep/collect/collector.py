@@ -177,10 +177,8 @@ def usual_shard_episodes(
 ) -> int:
     """Episodes in a shard of the usual size, judging by the data set's first few.
 
-    A batch's shards have 100,000 steps, each with all threads; other environments' 20,000, since
-    they are made side by side. A data set that is there already keeps its own number. Where no
-    episode can be played again, a robot may exist once: none is played for this, and each is
-    written when it is over.
+    A data set that is there already keeps its own number. Where no episode can be played again, a
+    robot may exist once: none is played for this, and each is written when it is over.
     """
     if exists(folder / MANIFEST):
         return read_manifest(folder).settings.shard_episodes

@@ -26,10 +26,6 @@ Array = NDArray[Any]
 class Growth:
     """A data set that lacks episodes: whole shards are written as soon as they are made.
 
-    Args:
-        folder: of the data set.
-        manifest: of what is there, with as many steps as are wanted.
-
     Attributes:
         manifest: of the full shards that are there.
         rows, episodes: how many there are, in files or held for the next one.
@@ -75,21 +71,13 @@ Produce = Callable[[Growth, Tick], Iterator[Columns]]
 
 @dataclass(frozen=True)
 class Simulator:
-    """Makes the shards of a data set, each a function of its number and the settings alone.
-
-    Attributes:
-        settings: of the data set.
-        policy: of the settings.
-        lanes: environments of a batch, stepped at once.
-        num_threads: threads to step a batch on; None takes one for each core.
-        retries: how often an episode in which the environment fails is played again.
-    """
+    """Makes the shards of a data set, each a function of its number and the settings alone."""
 
     settings: DataSettings
-    policy: Policy
-    lanes: int = LANES
-    num_threads: int | None = None
-    retries: int = 0
+    policy: Policy  # of the settings
+    lanes: int = LANES  # environments of a batch, stepped at once
+    num_threads: int | None = None  # to step a batch on; None takes one for each core
+    retries: int = 0  # how often an episode in which the environment fails is played again
 
     def in_turn(self, growth: Growth, tick: Tick) -> Iterator[Columns]:
         """Make one shard after the other, each with all threads."""

@@ -14,20 +14,13 @@ _NOTHING = 1e-18  # beside w^2 + z^2 in single precision, unless a robot is upsi
 
 
 class Formula(NamedTuple):
-    """A map of some numbers to others, and the way back.
+    """A map of some numbers to others, and the way back."""
 
-    Attributes:
-        takes: how many numbers.
-        gives: endings of the names of those that it gives.
-        forward: (library, columns, soft) to columns.
-        solves: how many of the numbers that it takes, from the first on, `inverse` gives back.
-        inverse: (library, what it gave and then the other numbers that it takes, soft) to columns.
-    """
-
-    takes: int
-    gives: tuple[str, ...]
-    forward: Callable[[Any, Columns, float], Columns]
-    solves: int = 0
+    takes: int  # how many numbers
+    gives: tuple[str, ...]  # endings of the names of those that it gives
+    forward: Callable[[Any, Columns, float], Columns]  # of library, columns and soft
+    solves: int = 0  # how many of the numbers that it takes, from the first on, come back
+    # of the library, what `forward` gave and then the other numbers that it takes, and soft
     inverse: Callable[[Any, Columns, float], Columns] | None = None
 
 

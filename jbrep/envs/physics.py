@@ -168,15 +168,11 @@ def can_be_pushed(model: mujoco.MjModel) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The n states of MuJoCo that a robot went through.
+    """The n states of MuJoCo that a robot went through."""
 
-    Args:
-        model: the robot and its surroundings.
-        arrays: of `mujoco.MjData`, (n, ...) each; those left out are as in a new one. `ctrl` is
-            what was held in the step that led to a state.
-    """
-
-    model: mujoco.MjModel
+    model: mujoco.MjModel  # the robot and its surroundings
+    # of `mujoco.MjData`, (n, ...) each; those left out are as in a new one. `ctrl` is what was held
+    # in the step that led to a state
     arrays: Mapping[str, Array]
 
     def __len__(self) -> int:

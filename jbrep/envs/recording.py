@@ -73,28 +73,17 @@ class Recording:
     """What n lanes went through in T steps; the first axis is time.
 
     A lane whose episode ended early stands still: its rows from `length` on mean nothing.
-
-    Attributes:
-        start: the task's arrays before the first step, (n, width) each.
-        observation: before, between and after the steps, (T + 1, n, d) float32.
-        arrays: what was read at the same times, (T + 1, n, ...) each.
-        action: (T, n, k).
-        reward: (T, n) float32.
-        terminated: whether a state ended the episode, (n,).
-        truncated: whether the time limit did, or physics that diverged, (n,).
-        length: of each episode, (n,).
-        missing: readings in each episode in whose place is the one before, or at which it ended.
     """
 
-    start: Mapping[str, Array]
-    observation: NDArray[np.float32]
-    arrays: Mapping[str, Array]
-    action: NDArray[Any]
-    reward: NDArray[np.float32]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-    length: NDArray[np.int32]
-    missing: NDArray[np.int64]
+    start: Mapping[str, Array]  # the task's arrays before the first step, (n, width) each
+    observation: NDArray[np.float32]  # before, between and after the steps, (T + 1, n, d)
+    arrays: Mapping[str, Array]  # what was read at the same times, (T + 1, n, ...) each
+    action: NDArray[Any]  # (T, n, k)
+    reward: NDArray[np.float32]  # (T, n)
+    terminated: NDArray[np.bool_]  # whether a state ended the episode, (n,)
+    truncated: NDArray[np.bool_]  # whether the time limit did, or physics that diverged, (n,)
+    length: NDArray[np.int32]  # of each episode, (n,)
+    missing: NDArray[np.int64]  # readings for which the one before stands, or the end, (n,)
 
 
 def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = read_nothing) -> Recording:

@@ -39,26 +39,16 @@ def read_xml() -> str:
 
 @dataclass(frozen=True)
 class Body:
-    """How a body differs from the published one in the default pose.
+    """How a body differs from the published one in the default pose: what is added to that."""
 
-    Attributes:
-        number: what it is drawn from.
-        materials: whether densities and gear are drawn, too; they are the published ones if not.
-        knees, feet: shifts of legs 1 to 4, (4, 3) each [m].
-        weight: shift of the weight, (3,) [m].
-        weight_size: added to the weight's three semi-axes [m].
-        densities: added to the densities 38.5, 770 and 7,700, (3,) [kg/m^3].
-        gear: added to the motor's gear.
-    """
-
-    number: int
-    materials: bool
-    knees: Array = field(compare=False, repr=False)
-    feet: Array = field(compare=False, repr=False)
-    weight: Array = field(compare=False, repr=False)
-    weight_size: float = field(compare=False, repr=False)
-    densities: Array = field(compare=False, repr=False)
-    gear: float = field(compare=False, repr=False)
+    number: int  # what it is drawn from
+    materials: bool  # whether densities and gear are drawn, too
+    knees: Array = field(compare=False, repr=False)  # of legs 1 to 4, (4, 3) [m]
+    feet: Array = field(compare=False, repr=False)  # likewise
+    weight: Array = field(compare=False, repr=False)  # to its place, (3,) [m]
+    weight_size: float = field(compare=False, repr=False)  # to its three semi-axes [m]
+    densities: Array = field(compare=False, repr=False)  # to 38.5, 770 and 7,700, (3,) [kg/m^3]
+    gear: float = field(compare=False, repr=False)  # to the motor's
 
     def reshape(self, spec: mujoco.MjSpec) -> None:
         """Turn the published robot into this one.

@@ -37,17 +37,11 @@ _IN_MEMORY = 2e8  # [pixels], of three bytes
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast a film shows simulated time.
+    """How fast a film shows simulated time."""
 
-    Args:
-        fps: frames per second of the film.
-        speed: simulated seconds per second of the film.
-        seconds: simulated seconds to show, from the start; all if None.
-    """
-
-    fps: float = 25
-    speed: float = 1
-    seconds: float | None = None
+    fps: float = 25  # frames per second of the film
+    speed: float = 1  # simulated seconds per second of the film
+    seconds: float | None = None  # simulated ones to show, from the start; None for all
 
     def __post_init__(self) -> None:
         for what, value, (low, high) in (
@@ -173,14 +167,9 @@ class Film:
     """Episodes side by side; one that ends before the others stands still afterwards.
 
     Robots of MuJoCo are seen by a camera of their model; other environments draw themselves.
-
-    Args:
-        rollouts: the episodes, of the same task and from the same start.
-        camera: shows each episode.
-        pace: how fast to show them.
     """
 
-    rollouts: Sequence[Rollout]
+    rollouts: Sequence[Rollout]  # of the same task and from the same start
     camera: Camera
     pace: Pace
 

@@ -16,33 +16,19 @@ from jbrep.errors import InputError
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
-    """An episode of n steps; states are before, between and after the steps.
-
-    Args:
-        task: whose episode it is.
-        name: where the episode comes from, for titles.
-        seed: of the episode.
-        observation: of each state in physical units, (n + 1, d).
-        action: (n, k).
-        reward: of each step, (n,).
-        terminated: whether a state ended the episode.
-        truncated: whether the time limit did, or physics that diverged.
-        motion: of the robot, n + 1 states; None where there is no MuJoCo.
-        note: why there is no motion though the environment may have one.
-        encoder: through which a trained policy observed; None if it observed all features.
-    """
+    """An episode of n steps; states are before, between and after the steps."""
 
     task: Task
-    name: str
+    name: str  # where the episode comes from, for titles
     seed: int
-    observation: NDArray[np.float32]
-    action: NDArray[np.floating]
-    reward: NDArray[np.float32]
-    terminated: bool
-    truncated: bool
-    motion: Motion | None = None
-    note: str = ""
-    encoder: BaseEncoder | None = None
+    observation: NDArray[np.float32]  # of each state in physical units, (n + 1, d)
+    action: NDArray[np.floating]  # (n, k)
+    reward: NDArray[np.float32]  # of each step, (n,)
+    terminated: bool  # whether a state ended the episode
+    truncated: bool  # whether the time limit did, or physics that diverged
+    motion: Motion | None = None  # of the robot, n + 1 states; None where there is no MuJoCo
+    note: str = ""  # why there is no motion though the environment may have one
+    encoder: BaseEncoder | None = None  # of a trained policy that doesn't observe all features
 
     def __len__(self) -> int:
         return len(self.action)

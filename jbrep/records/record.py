@@ -166,9 +166,10 @@ def _at(
             yield node, words
         case inspect.StructType(tag_field=tag_field, tag=tag) if tag_field == steps[0]:
             yield inspect.LiteralType((tag,)), ""
-        case inspect.StructType(fields=fields):
-            found = (each.type for each in fields if each.encode_name == steps[0])
-            yield from chain(*(_at(each, steps[1:]) for each in found))
+        case inspect.StructType(fields=fields, array_like=is_list):
+            names = [str(i) if is_list else each.encode_name for i, each in enumerate(fields)]
+            if steps[0] in names:
+                yield from _at(fields[names.index(steps[0])].type, steps[1:])
         case inspect.CollectionType(item_type=item) | inspect.DictType(value_type=item):
             yield from _at(item, steps[1:])
 

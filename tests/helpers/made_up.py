@@ -24,14 +24,11 @@ from jbrep.rl.files import (
     Evaluation,
     RunRecord,
 )
-from jbrep.rl.learner import Learner
 from jbrep.rl.overrides import check_shape
 from jbrep.rl.training import packages
 from jbrep.stats.analysis import to_plain
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan
-from jbrep.study.record import EncoderFacts, Label, LabelSettings
-from jbrep.study.tables import Return
 
 COMMITS = {"jbrep": "1" * 40}
 STILL = 250
@@ -57,33 +54,6 @@ STUDY = as_study(
         },
     }
 )
-
-
-def label_of(task, representation, encoder=(), decoder=(), kind="dae", latent_size=0, **training):
-    """What runs.json says of the runs of SAC on a task, and of their encoder, layer by layer."""
-    learner = Learner.of("sac")
-    settings = LabelSettings(
-        **{"task": task.name, "environment": task, "representation": representation},
-        **{"algorithm": "sac", "preset": "paper", "learner": "sac", "overrides": {}},
-        **{"hyperparameters": learner.hyperparameters, "encoder": "0" * 64, "encoder_code": None},
-        **{"steps": 20_000, "evaluate_every": 2000, "evaluation_episodes": 2, "final_episodes": 2},
-        **{"device": "cpu", "begin_from": None},
-    )
-    facts = EncoderFacts(
-        **{"name": representation, "kind": kind, "size": task.size, "latent_size": latent_size},
-        **{"encoder": encoder, "decoder": decoder, "training": training, "data": {}, "metrics": {}},
-    )
-    return Label(settings=settings, encoder=facts)
-
-
-def returns_of(runs):
-    """The rows of returns.csv of runs."""
-    return [
-        Return(run.task, run.algorithm, run.representation, run.seed, int(step), i, float(each))
-        for run in runs
-        for step, episodes in zip(run.steps, run.returns, strict=True)
-        for i, each in enumerate(episodes)
-    ]
 
 
 def found_of(analysis, runs=(), in_training=None, **changes):

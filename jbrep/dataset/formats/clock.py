@@ -63,9 +63,7 @@ def _resampled(
     values = np.column_stack(signals)
     known = np.isfinite(values)
     if not (has_some := known.any(axis=0)).all():
-        silent = listed(
-            [leaf.name for leaf, some in zip(leaves, has_some, strict=True) if not some]
-        )
+        silent = listed([leaves[i].name for i in np.flatnonzero(~has_some)])
         counts["row", f"of episodes without a reading of {silent}: left out"] += len(time)
         return
     begin = time[known.argmax(axis=0)].max()
@@ -80,8 +78,8 @@ def _resampled(
     most = max(_MOST_GROWTH * len(time), _MOST_SHORT)
     if not length <= min(most, _MOST_NUMBERS / values.shape[1], MOST_RAW):
         raise InputError(
-            f"an episode of {len(time):,} rows lasts {time[-1] - begin:.6g} s, {length:,.6g} rows at "
-            f"{rate:g} Hz: correct its times, end it at pauses by --gap, or give a lower --rate"
+            f"an episode of {len(time):,} rows lasts {time[-1] - begin:.6g} s, {length:,.6g} rows "
+            f"at {rate:g} Hz: correct its times, end it at pauses by --gap, or give a lower --rate"
         )
     count = math.ceil(length - _LATE) if has_final else int(length + _SLACK) + 1
     grid = begin + np.arange(count) / rate

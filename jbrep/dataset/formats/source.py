@@ -131,10 +131,12 @@ class Source:
 
     def _turned(self, seen: Array) -> Array:
         """Observations (n, d) with their angles in [-pi, pi) rad."""
-        for i in np.flatnonzero(np.nanmax(np.abs(seen), axis=0, initial=0) > MOST_RADIANS):
+        if not self._angles.any():
+            return seen
+        for i in np.flatnonzero(np.fmax.reduce(np.abs(seen), axis=0, initial=0) > MOST_RADIANS):
             check_radians(self.name, self._roles["observation"][i])
         turned = seen * self._factors
-        return np.where(self._angles, wrapped(turned), turned) if self._angles.any() else seen
+        return np.where(self._angles, wrapped(turned), turned)
 
     def _rows(self) -> Iterator[Rows]:
         first, origin, labels = 0, None, dict[Any, int]()
@@ -230,8 +232,8 @@ class Source:
             if turn and not leaf.is_angle:
                 unit = "deg" if turn > MOST_RADIANS else "rad"
                 notes.append(
-                    f"{leaf.name} jumps by a full turn, {turn:.4g}: if it is an angle, give --angles "
-                    f"{leaf.name} --units {leaf.name}={unit}"
+                    f"{leaf.name} jumps by a full turn, {turn:.4g}: if it is an angle, give "
+                    f"--angles {leaf.name} --units {leaf.name}={unit}"
                 )
         if angles := int(self._angles.sum()):
             degrees = int((self._factors != 1).sum())
