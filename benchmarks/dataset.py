@@ -21,7 +21,7 @@ from rows import make_rows
 from timing import show, timed
 
 from jbrep import jitterbug
-from jbrep.collect import collect
+from jbrep.collecting import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.envs import describe
 from jbrep.jitterbug.simulation import PHYSICS_STEPS, fast_model, stop_profiling

@@ -15,10 +15,10 @@ from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 from torch.utils.data import DataLoader, TensorDataset
 
+from jbrep.dae import DAE, NOISE, Gradient, Reconstruction
 from jbrep.encoders import find
 from jbrep.encoders.layers import run
 from jbrep.envs import describe
-from jbrep.methods.autoencoder import DAE, NOISE, Gradient, Reconstruction
 from jbrep.training.network import ARCHITECTURES, stacks
 from jbrep.training.trainer import Schedule, Trainer
 from jbrep.training.windows import Windows

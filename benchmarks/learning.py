@@ -26,9 +26,9 @@ from jbrep.envs import describe
 from jbrep.rl import train
 from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.presets import get_preset
-from jbrep.study.config import Study
-from jbrep.study.plan import Plan
-from jbrep.study.runner import on_this_machine, run_study
+from jbrep.studies.config import Study
+from jbrep.studies.plan import Plan
+from jbrep.studies.runner import on_this_machine, run_study
 
 TASK = "face_direction"
 ROUNDS = 12

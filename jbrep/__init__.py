@@ -8,10 +8,7 @@ Importing it registers the Jitterbug's environments with Gymnasium; nothing heav
 it is used.
 """
 
-import sys
-from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -36,40 +33,17 @@ if TYPE_CHECKING:
     from jbrep.envs.task import Feature as Feature
     from jbrep.envs.task import Task as Task
     from jbrep.rl.controller import load_policy as load_policy
-    from jbrep.study.config import Study as Study
+    from jbrep.studies.config import Study as Study
 
 _load, _, __all__ = exports(__name__)
 
 
 def __getattr__(name: str) -> Any:
-    if name in __all__ and find_spec(f"{__name__}.{name}"):
-        return import_module(f"{__name__}.{name}")
     return version(__name__) if name == "__version__" else _load(name)
 
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
-
-
-class _Callable(ModuleType):
-    """A module that is a function of `jbrep.api`, too."""
-
-    def __call__(self, *args: Any, **options: Any) -> Any:
-        return getattr(import_module("jbrep.api"), self.__name__.partition(".")[2])(
-            *args, **options
-        )
-
-
-class _Package(ModuleType):
-    """This package, in which some modules can be called as soon as they are imported."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in __all__ and isinstance(value, ModuleType):
-            value.__class__ = _Callable
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
 
 
 def _register(_gymnasium: ModuleType) -> None:

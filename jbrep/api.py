@@ -40,13 +40,13 @@ if TYPE_CHECKING:
     from jbrep.dataset import Dataset
     from jbrep.encoders import Encoder
     from jbrep.envs.task import Task
-    from jbrep.evaluate.evaluation import Diagnostics, Evaluation
+    from jbrep.evaluation.evaluation import Diagnostics, Evaluation
     from jbrep.methods.fit import Fitted, Fitter
-    from jbrep.report.report import Report
+    from jbrep.reporting.report import Report
     from jbrep.rl.controller import Controller
     from jbrep.rl.files import RunRecord
     from jbrep.rl.run_settings import RunSettings
-    from jbrep.study import Study
+    from jbrep.studies import Study
 
 
 class Agent(NamedTuple):
@@ -115,13 +115,13 @@ class Judged(NamedTuple):
         return self.evaluation.encoders
 
     def __repr__(self) -> str:
-        from jbrep.report.evaluation import evaluation_text
+        from jbrep.reporting.evaluation import evaluation_text
         from jbrep.text import terminal_width
 
         return evaluation_text(self.evaluation, terminal_width())
 
     def _repr_html_(self) -> str:
-        from jbrep.report.evaluation import evaluation_html
+        from jbrep.reporting.evaluation import evaluation_html
 
         return evaluation_html(self.evaluation)
 
@@ -155,8 +155,8 @@ def collect(
             jbrep policies), ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3; the folder of a run; or
             several with weights, of which each episode has one: uniform:0.5+runs/a:0.5.
     """
-    from jbrep.collect.collector import collect as run
-    from jbrep.collect.collector import usual_shard_episodes
+    from jbrep.collecting.collector import collect as run
+    from jbrep.collecting.collector import usual_shard_episodes
     from jbrep.dataset import Dataset, DataSettings
     from jbrep.dataset.settings import TRAINED, parts_of
     from jbrep.envs.description import as_task
@@ -262,18 +262,18 @@ def evaluate(
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
-    from jbrep.evaluate.evaluation import EVALUATION
+    from jbrep.evaluation.evaluation import EVALUATION
     from jbrep.records.storage import make_folder
 
     scaled = ScaledDataset.of(data)
     whole = Dataset(truth) if isinstance(truth, str | Path) else truth
     if whole is not None:
-        from jbrep.evaluate.held_out import hidden_of
+        from jbrep.evaluation.held_out import hidden_of
 
         hidden_of(scaled.dataset, whole)
     if out is not None:
         make_folder(Path(out), (EVALUATION,))
-    from jbrep.evaluate.diagnosis import diagnose, write  # imports torch
+    from jbrep.evaluation.diagnosis import diagnose, write  # imports torch
     from jbrep.play.sources import find_good_policy
 
     own_rewards = bool(scaled.dataset.manifest.settings.reward)
@@ -398,9 +398,9 @@ def study(
         study: a `Study`, what its file would hold as a dictionary, or the file.
         out: a folder; one that was stopped goes on. By default runs/NAME of the study's file.
     """
-    from jbrep.study import Plan, Study, read_study, run_study
-    from jbrep.study.config import as_study
-    from jbrep.study.runner import BACKENDS
+    from jbrep.studies import Plan, Study, read_study, run_study
+    from jbrep.studies.config import as_study
+    from jbrep.studies.runner import BACKENDS
     from jbrep.text import counted
 
     if isinstance(study, str | Path):
@@ -438,7 +438,7 @@ def report(
         raise InputError(f"{folder} is not the folder of a study: there is no such folder")
     if out:
         make_folder(Path(out))
-    from jbrep.report.report import make_report  # imports torch
+    from jbrep.reporting.report import make_report  # imports torch
 
     return make_report(Path(folder), Path(out) if out else None, evaluation)
 

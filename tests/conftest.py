@@ -26,7 +26,7 @@ needs_egl = pytest.mark.skipif(not HEADLESS, reason="no EGL: install libegl1 and
 @pytest.fixture(scope="session", autouse=True)
 def quick_figures():
     """Fonts as outlines: embedding them takes half of a report's time."""
-    from jbrep.report.figures.panels import PAPER
+    from jbrep.reporting.figures.panels import PAPER
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PAPER, "pdf.fonttype", 3)
@@ -43,7 +43,7 @@ def same_numbers(request):
 @pytest.fixture
 def one_figure(monkeypatch):
     """Reports with their first figure alone: drawing all takes most of their time."""
-    from jbrep.report import report
+    from jbrep.reporting import report
 
     draw = report.study_plots
     monkeypatch.setattr(report, "study_plots", lambda found: draw(found)[:1])
@@ -53,7 +53,7 @@ def one_figure(monkeypatch):
 def quick_evaluations():
     """Nonlinear regressions that learn little; test_prediction.py has them learn."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jbrep.evaluate.regression._STEPS", 2)
+        patch.setattr("jbrep.evaluation.regression._STEPS", 2)
         patch.setattr("jbrep.play.sources._GOOD_EPISODES", 2)
         yield
 
@@ -62,7 +62,7 @@ def collected_once(name, settings, tmp_path_factory):
     """Collected by the worker that needs it first; the other reads the same files."""
     from filelock import FileLock
 
-    from jbrep.collect import collect
+    from jbrep.collecting import collect
 
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base

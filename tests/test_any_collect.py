@@ -10,11 +10,11 @@ import pytest
 from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
 from small import contents, settings
 
-from jbrep.collect import backends, collect
-from jbrep.collect.derive import derive
-from jbrep.collect.policies import Uniform
-from jbrep.collect.replay import repair, replay_problems
-from jbrep.collect.shards import Growth, Simulator
+from jbrep.collecting import backends, collect
+from jbrep.collecting.derive import derive
+from jbrep.collecting.policies import Uniform
+from jbrep.collecting.replay import repair, replay_problems
+from jbrep.collecting.shards import Growth, Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export
 from jbrep.dataset.manifest import find_problems, new_manifest, read_manifest

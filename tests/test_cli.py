@@ -21,7 +21,7 @@ from jbrep.cli.signals import stoppable
 from jbrep.encoders import find, load, save
 from jbrep.encoders.shipped import unlearned
 from jbrep.envs import describe
-from jbrep.evaluate.table import Diagnosed, diagnostics_text
+from jbrep.evaluation.table import Diagnosed, diagnostics_text
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.registry import METHODS
 from jbrep.records.record import from_text

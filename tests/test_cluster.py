@@ -12,11 +12,11 @@ from small import contents
 from test_any_collect import some
 from test_study import TINY
 
-from jbrep.collect import collect
-from jbrep.study import runner
-from jbrep.study.plan import Plan
-from jbrep.study.runner import work
-from jbrep.study.tables import read_curves
+from jbrep.collecting import collect
+from jbrep.studies import runner
+from jbrep.studies.plan import Plan
+from jbrep.studies.runner import work
+from jbrep.studies.tables import read_curves
 
 DATA = some(steps=12_000, shard_episodes=50)
 STUDY = TINY.replace(seeds=(0,), steps=1000, evaluate_every=1000)

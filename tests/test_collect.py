@@ -16,9 +16,9 @@ from kills import COMMAND, kill_and_resume
 from small import contents, settings, write_again, written
 
 from jbrep import jitterbug
-from jbrep.collect import collect, write_shards
-from jbrep.collect.derive import derive
-from jbrep.collect.replay import repair, replay_problems
+from jbrep.collecting import collect, write_shards
+from jbrep.collecting.derive import derive
+from jbrep.collecting.replay import repair, replay_problems
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.manifest import find_problems, open_shard, read_manifest, write_manifest
 from jbrep.dataset.schema import episode_seed

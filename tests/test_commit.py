@@ -5,7 +5,7 @@ import subprocess
 import pytest
 from small import contents, settings, write_again
 
-from jbrep.collect import collect
+from jbrep.collecting import collect
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import read_manifest, write_manifest
 from jbrep.encoders import find, load, save

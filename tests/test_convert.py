@@ -14,13 +14,13 @@ from small import ONE_EACH
 from torch import nn
 from torch.nn import functional
 
+from jbrep.dae import DAE
 from jbrep.encoders import ACTIVATIONS, Encoder, Layer, find, load, save
 from jbrep.encoders.card import card
 from jbrep.encoders.layers import activate
 from jbrep.encoders.onnx import export
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.methods.autoencoder import DAE
 from jbrep.methods.registry import name_of, read_name
 from jbrep.rl import Run, train
 from jbrep.rl.controller import export as export_policy

@@ -5,9 +5,9 @@ import pytest
 import small
 from small import contents, flip_bit, settings, written
 
-from jbrep.collect import collect
-from jbrep.collect.derive import derive
-from jbrep.collect.replay import repair, replay_problems
+from jbrep.collecting import collect
+from jbrep.collecting.derive import derive
+from jbrep.collecting.replay import repair, replay_problems
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.manifest import MANIFEST, commit, open_shard, read_manifest, write_manifest
 from jbrep.errors import InputError

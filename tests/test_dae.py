@@ -6,9 +6,9 @@ import torch
 from tensors import TensorWindows, torch_threads
 from torch.nn.functional import mse_loss
 
+from jbrep.dae import DAE, Gradient, Reconstruction
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
-from jbrep.methods.autoencoder import DAE, Gradient, Reconstruction
 from jbrep.training.network import ARCHITECTURES, layers, stacks
 from jbrep.training.trainer import Schedule, Trainer
 from jbrep.training.windows import POOL, RUN, shuffled

@@ -10,7 +10,7 @@ import pytest
 from command import jbrep
 from small import settings, write_again
 
-from jbrep.collect import collect
+from jbrep.collecting import collect
 from jbrep.dataset import Dataset, Scaler, manifest
 from jbrep.dataset.columns import Column
 from jbrep.errors import InputError

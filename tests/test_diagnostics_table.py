@@ -6,9 +6,9 @@ import pytest
 from wide import wide
 
 from jbrep.errors import DamageError, InputError
-from jbrep.evaluate import diagnose
-from jbrep.evaluate.evaluation import _REGISTERED, Scalar, Score, diagnostic
-from jbrep.evaluate.table import (
+from jbrep.evaluation import diagnose
+from jbrep.evaluation.evaluation import _REGISTERED, Scalar, Score, diagnostic
+from jbrep.evaluation.table import (
     SCALARS,
     Diagnosed,
     by_label,
@@ -16,7 +16,7 @@ from jbrep.evaluate.table import (
     headline,
     read_diagnostics,
 )
-from jbrep.report.evaluation import evaluation_text
+from jbrep.reporting.evaluation import evaluation_text
 
 ROWS = [
     Diagnosed("face_direction", "dae-8", "a" * 64, {"forward": 0.25, "value": None}),
@@ -28,7 +28,7 @@ KEY = "task,representation,sha256"
 
 def test_a_registered_function_is_measured_shown_and_tabled(monkeypatch, tmp_path):
     """Nothing else is to be changed for a further diagnostic."""
-    monkeypatch.setattr("jbrep.evaluate.evaluation._REGISTERED", [*_REGISTERED])
+    monkeypatch.setattr("jbrep.evaluation.evaluation._REGISTERED", [*_REGISTERED])
 
     @diagnostic(Scalar("farthest", "the largest mean of a unit", better=-1))
     def farthest(e):

@@ -15,10 +15,10 @@ from jbrep.coordinates import make_coordinates
 from jbrep.dataset.layout import Layout
 from jbrep.encoders.header import EncoderHeader
 from jbrep.envs import describe
-from jbrep.evaluate import evaluation
+from jbrep.evaluation import evaluation
 from jbrep.rl.settings import TrainingSettings
 from jbrep.stats.rules import Rules
-from jbrep.study.config import Data, Study, as_study
+from jbrep.studies.config import Data, Study, as_study
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / name for name in ("README.md", "data/README.md", "CONTRIBUTING.md")]

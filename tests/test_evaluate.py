@@ -18,19 +18,19 @@ from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.encoders.header import EncoderHeader
 from jbrep.encoders.shipped import unlearned
 from jbrep.errors import InputError
-from jbrep.evaluate import diagnose
-from jbrep.evaluate.diagnosis import seen, write
-from jbrep.evaluate.evaluation import EVALUATION, Evaluation, Judged
-from jbrep.evaluate.held_out import MAX_NUMBERS, HeldOut, sample_rows
-from jbrep.evaluate.readout import dynamics, latent_units, probes, quantities
-from jbrep.evaluate.reconstruction import reconstruction
-from jbrep.evaluate.regression import ridge
+from jbrep.evaluation import diagnose
+from jbrep.evaluation.diagnosis import seen, write
+from jbrep.evaluation.evaluation import EVALUATION, Evaluation, Judged
+from jbrep.evaluation.held_out import MAX_NUMBERS, HeldOut, sample_rows
+from jbrep.evaluation.readout import dynamics, latent_units, probes, quantities
+from jbrep.evaluation.reconstruction import reconstruction
+from jbrep.evaluation.regression import ridge
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.controls import Random
 from jbrep.methods.linear import principal_code
 from jbrep.records.document import read_document
-from jbrep.report import figures
-from jbrep.report.evaluation import evaluation_text
+from jbrep.reporting import figures
+from jbrep.reporting.evaluation import evaluation_text
 from jbrep.stats.bootstrap import bootstrap
 
 
@@ -331,7 +331,7 @@ def test_an_evaluation_is_one_file_and_repeats(data, tmp_path):
 def test_the_command_says_which_encoders_were_taken(collected, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(figures, "encoder_plots", lambda evaluation: [])  # they take seconds
-    monkeypatch.setattr("jbrep.evaluate.regression._STEPS", 20)
+    monkeypatch.setattr("jbrep.evaluation.regression._STEPS", 20)
     save(find("pca-4", "face_direction").with_header(name="dae-4"), Path("dae-4"))
     chosen = ("--encoder", "dae-4", "./dae-4")
     shown = jbrep("evaluate", *chosen, "--data", collected, "--out", "judged").stdout

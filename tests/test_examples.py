@@ -19,12 +19,12 @@ from command import in_this_process
 from small import ONE_EACH
 
 from jbrep.envs.description import describe
-from jbrep.evaluate import regression
+from jbrep.evaluation import regression
 from jbrep.play.sources import find_player
 from jbrep.rl import Run, train
 from jbrep.rl.controller import export, load_policy
 from jbrep.rl.policy_file import find_shipped as find
-from jbrep.study.runner import BACKENDS
+from jbrep.studies.runner import BACKENDS
 
 OWN = Path("examples/own/own.py").resolve()
 ROBOT = Path("examples/robot").resolve()

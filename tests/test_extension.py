@@ -11,9 +11,9 @@ import pytest
 from command import jbrep
 from small import brief, contents, write_again, written
 
-from jbrep.collect import collect
-from jbrep.collect.derive import derive
-from jbrep.collect.replay import repair
+from jbrep.collecting import collect
+from jbrep.collecting.derive import derive
+from jbrep.collecting.replay import repair
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, find_problems, read_manifest, write_manifest
 from jbrep.errors import InputError

@@ -5,10 +5,10 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal, Normal, kl_divergence
 
+from jbrep.dae import DAE
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.methods import vae
-from jbrep.methods.autoencoder import DAE
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import METHODS, name_of, read_name
 from jbrep.methods.vae import cross_entropy, divergence, posterior

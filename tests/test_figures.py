@@ -10,10 +10,10 @@ from judged import NOTHING, diagnostics, evaluation
 from made_up import drawn, found_of
 from PIL import Image
 
-from jbrep.evaluate.evaluation import FeatureError, Prediction, Reconstruction, Score
-from jbrep.report.figures import encoder_plots, study_plots, write
-from jbrep.report.figures.panels import COLUMN, PAGE, PAPER, fitting
-from jbrep.report.findings import Verdict
+from jbrep.evaluation.evaluation import FeatureError, Prediction, Reconstruction, Score
+from jbrep.reporting.figures import encoder_plots, study_plots, write
+from jbrep.reporting.figures.panels import COLUMN, PAGE, PAPER, fitting
+from jbrep.reporting.findings import Verdict
 from jbrep.stats import RunCurve, analyse
 
 STEPS = np.arange(0, 50_001, 10_000)

@@ -17,12 +17,12 @@ from threadpoolctl import threadpool_limits
 from wide import wide
 
 from jbrep import methods
+from jbrep.dae import DAE
 from jbrep.dataset import Dataset, ScaledDataset, from_arrays
 from jbrep.encoders import load
 from jbrep.errors import InputError
-from jbrep.evaluate.held_out import HeldOut
-from jbrep.evaluate.reconstruction import reconstruction
-from jbrep.methods.autoencoder import DAE
+from jbrep.evaluation.held_out import HeldOut
+from jbrep.evaluation.reconstruction import reconstruction
 from jbrep.methods.fit import Fitter
 from jbrep.methods.linear import lost, ratio_to_pca
 from jbrep.methods.registry import METHODS, read_name

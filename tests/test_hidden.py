@@ -3,11 +3,11 @@
 import pytest
 from command import jbrep, mistake
 
-from jbrep.collect import collect
-from jbrep.collect.derive import derive_view
+from jbrep.collecting import collect
+from jbrep.collecting.derive import derive_view
 from jbrep.dataset import Dataset, DataSettings, ScaledDataset
 from jbrep.envs import describe
-from jbrep.evaluate import diagnose, regression
+from jbrep.evaluation import diagnose, regression
 from jbrep.methods.fit import Fitter
 
 SPEED = "obs_2"

@@ -22,8 +22,8 @@ from command import jbrep
 from gymnasium import spaces
 from small import flip_bit, settings
 
-from jbrep.collect import collect
-from jbrep.collect.replay import repair, replay_problems
+from jbrep.collecting import collect
+from jbrep.collecting.replay import repair, replay_problems
 from jbrep.dataset import Dataset, from_arrays
 from jbrep.dataset.formats import FORMATS, export, open_sources
 from jbrep.dataset.formats.writer import write

@@ -11,16 +11,16 @@ from jbrep.envs import describe
 from jbrep.envs.infos import by_name, number_of, numbers_in, shares, shares_text
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.names import import_modules
-from jbrep.report import report
-from jbrep.report.findings import Findings
-from jbrep.report.tables import read_tables
-from jbrep.report.views import returns_tables
+from jbrep.reporting import report
+from jbrep.reporting.findings import Findings
+from jbrep.reporting.tables import read_tables
+from jbrep.reporting.views import returns_tables
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, INFOS, Info, read_infos, read_run
-from jbrep.study.config import Study
-from jbrep.study.plan import Plan
-from jbrep.study.runner import run_study
-from jbrep.study.tables import RUN_INFOS, Return, RunInfo
+from jbrep.studies.config import Study
+from jbrep.studies.plan import Plan
+from jbrep.studies.runner import run_study
+from jbrep.studies.tables import RUN_INFOS, Return, RunInfo
 
 import_modules(["environments"])
 SCORED = "Sledges/Scored-v0"

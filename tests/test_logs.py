@@ -33,8 +33,8 @@ from foreign import (
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
-from jbrep.collect import collect
-from jbrep.collect.derive import derive_view
+from jbrep.collecting import collect
+from jbrep.collecting.derive import derive_view
 from jbrep.dataset import (
     Dataset,
     DataSettings,
@@ -47,9 +47,9 @@ from jbrep.dataset import (
 from jbrep.dataset.manifest import find_problems
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.evaluate.diagnosis import diagnose
+from jbrep.evaluation.diagnosis import diagnose
 from jbrep.methods.fit import Fitter
-from jbrep.report.evaluation import untold
+from jbrep.reporting.evaluation import untold
 
 NAMED = ("--observations", "pitch,gyro,ticks", "--actions", "u", "--time", "time")
 

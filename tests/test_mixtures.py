@@ -5,10 +5,10 @@ import pytest
 from command import jbrep
 from small import contents, settings
 
-from jbrep.collect import collect
-from jbrep.collect.derive import derive
-from jbrep.collect.policies import parse_policy
-from jbrep.collect.replay import repair
+from jbrep.collecting import collect
+from jbrep.collecting.derive import derive
+from jbrep.collecting.policies import parse_policy
+from jbrep.collecting.replay import repair
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export
 from jbrep.dataset.manifest import find_problems

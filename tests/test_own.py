@@ -26,11 +26,11 @@ from jbrep.encoders.base import as_encoder
 from jbrep.envs import describe
 from jbrep.envs.names import import_code
 from jbrep.errors import InputError
-from jbrep.evaluate import diagnose
+from jbrep.evaluation import diagnose
 from jbrep.inspection import inspect
 from jbrep.jitterbug import JitterbugEnv
-from jbrep.report.evaluation import evaluation_text
-from jbrep.report.figures import encoder_plots
+from jbrep.reporting.evaluation import evaluation_text
+from jbrep.reporting.figures import encoder_plots
 from jbrep.rl import Run, Session, train
 from jbrep.rl.files import CHECKPOINT, ENCODER, RUN
 from jbrep.rl.policy import load_run

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jbrep.collect.policies import (
+from jbrep.collecting.policies import (
     POLICIES,
     Constant,
     Heuristic,

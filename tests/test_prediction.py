@@ -15,12 +15,12 @@ from jbrep.encoders import Encoder, Layer
 from jbrep.encoders.header import EncoderHeader
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.evaluate import control, diagnose, regression
-from jbrep.evaluate.control import GoodPolicy, PlayedEpisode, lost, needs, returns_to_go
-from jbrep.evaluate.diagnosis import networks
-from jbrep.evaluate.evaluation import Judged, Lost, Score
-from jbrep.evaluate.held_out import HeldOut, explained
-from jbrep.evaluate.prediction import (
+from jbrep.evaluation import control, diagnose, regression
+from jbrep.evaluation.control import GoodPolicy, PlayedEpisode, lost, needs, returns_to_go
+from jbrep.evaluation.diagnosis import networks
+from jbrep.evaluation.evaluation import Judged, Lost, Score
+from jbrep.evaluation.held_out import HeldOut, explained
+from jbrep.evaluation.prediction import (
     Steps,
     changes,
     following,
@@ -28,11 +28,11 @@ from jbrep.evaluate.prediction import (
     problems,
     usual_horizons,
 )
-from jbrep.evaluate.readout import probes
-from jbrep.evaluate.regression import Networks, Problem, beside, fit
-from jbrep.evaluate.table import headline
+from jbrep.evaluation.readout import probes
+from jbrep.evaluation.regression import Networks, Problem, beside, fit
+from jbrep.evaluation.table import headline
 from jbrep.play.sources import find_good_policy
-from jbrep.report.evaluation import evaluation_text, judge
+from jbrep.reporting.evaluation import evaluation_text, judge
 
 NAMES = ("place", "speed", "load", "idle")
 STEPS, EPISODES = 60, 200
@@ -96,9 +96,9 @@ def controller(seen):
 def learning():
     """Steps and horizons enough for the cart."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jbrep.evaluate.prediction.HORIZONS", (1, 5, 10))
+        patch.setattr("jbrep.evaluation.prediction.HORIZONS", (1, 5, 10))
         patch.setattr(regression, "_STEPS", 400)
-        patch.setattr("jbrep.evaluate.control._SHARE", 1.0)
+        patch.setattr("jbrep.evaluation.control._SHARE", 1.0)
         yield
 
 
@@ -301,7 +301,7 @@ def test_a_rare_reward_is_learnt_beside_many_features(monkeypatch):
     moved = np.sin(2 * seen @ random.normal(size=(6, 20)))
     wanted = np.column_stack((moved, near)).astype(np.float32)
     steps = Steps(np.arange(20_000), seen, np.zeros((20_000, 1)), wanted)
-    monkeypatch.setattr("jbrep.evaluate.prediction.usual_horizons", lambda _: [10])
+    monkeypatch.setattr("jbrep.evaluation.prediction.usual_horizons", lambda _: [10])
     alone = SimpleNamespace(encode=lambda rows: rows)
     (pair,) = problems(alone, SimpleNamespace(data=None, once=lambda *_: steps)).values()
     together = Problem(steps.inputs(alone), wanted)

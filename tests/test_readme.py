@@ -10,8 +10,8 @@ import gymnasium
 import pytest
 from command import in_this_process, jbrep
 
-from jbrep.evaluate import regression
-from jbrep.study.runner import BACKENDS
+from jbrep.evaluation import regression
+from jbrep.studies.runner import BACKENDS
 
 ROOT = Path(__file__).parent.parent
 LESS = {  # by command: numbers in place of a page's, or beside them

@@ -16,18 +16,18 @@ from jbrep.errors import InputError
 from jbrep.records.document import read_document
 from jbrep.rl.files import RUN, read_run, runs_below
 from jbrep.rl.policy_file import shipped_file
-from jbrep.study.config import Data, read_study
-from jbrep.study.plan import (
+from jbrep.studies.config import Data, read_study
+from jbrep.studies.plan import (
     REGISTRATION,
     Plan,
     find_committed,
     registration_in,
     seal,
 )
-from jbrep.study.prepare import prepare
-from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.runner import register_study, run_study
-from jbrep.study.tables import write_tables
+from jbrep.studies.prepare import prepare
+from jbrep.studies.record import RECORD, RunsRecord
+from jbrep.studies.runner import register_study, run_study
+from jbrep.studies.tables import write_tables
 
 ROOT = Path(__file__).parent.parent
 TINIER = TINY.replace(representations=("full",), seeds=(0, 1))
@@ -140,7 +140,7 @@ def test_other_policies_and_data_than_were_registered_are_told(collected, tmp_pa
 
 
 def test_claims_in_a_work_tree_run_once_they_are_committed(repository, tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.report.report.write_report", lambda found, out: [out])
+    monkeypatch.setattr("jbrep.reporting.report.write_report", lambda found, out: [out])
     path, out = repository / "it.toml", tmp_path / "out"
     beside = repository / "it.registration.json"
     path.write_text(CLAIMS.toml())

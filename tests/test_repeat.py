@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small import settings
 
-from jbrep.collect import collect
+from jbrep.collecting import collect
 from jbrep.dataset import Dataset
 from jbrep.envs import describe
 from jbrep.envs.autoreset import AutoresetLanes

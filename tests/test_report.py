@@ -18,24 +18,32 @@ from small import adopt, forge
 
 from jbrep.encoders import find, save
 from jbrep.errors import InputError, Notice
-from jbrep.evaluate.diagnosis import SCALARS
-from jbrep.evaluate.table import DIAGNOSTICS
+from jbrep.evaluation.diagnosis import SCALARS
+from jbrep.evaluation.table import DIAGNOSTICS
 from jbrep.play.sources import find_episode
 from jbrep.records.document import document_from, read_document
 from jbrep.records.tables import write_csv, write_rows
-from jbrep.report import make_report, report, write_report
-from jbrep.report.figures import study_plots, write
-from jbrep.report.findings import Findings
-from jbrep.report.report import FIGURES, FINDINGS, MARKDOWN, PAGE, commands, results_text, summary
-from jbrep.report.tables import read_tables
-from jbrep.report.views import say, settings_tables, verdict_tables
+from jbrep.reporting import make_report, report, write_report
+from jbrep.reporting.figures import study_plots, write
+from jbrep.reporting.findings import Findings
+from jbrep.reporting.report import (
+    FIGURES,
+    FINDINGS,
+    MARKDOWN,
+    PAGE,
+    commands,
+    results_text,
+    summary,
+)
+from jbrep.reporting.tables import read_tables
+from jbrep.reporting.views import say, settings_tables, verdict_tables
 from jbrep.rl.files import ENCODER, EVALUATIONS, Evaluation, read_run
 from jbrep.stats.rules import Rules
-from jbrep.study.config import Study, as_study
-from jbrep.study.plan import Plan
-from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.runner import register_study
-from jbrep.study.tables import (
+from jbrep.studies.config import Study, as_study
+from jbrep.studies.plan import Plan
+from jbrep.studies.record import RECORD, RunsRecord
+from jbrep.studies.runner import register_study
+from jbrep.studies.tables import (
     REFERENCE_RETURNS,
     play_references,
     write_tables,
@@ -380,7 +388,7 @@ def test_of_single_runs_it_shows_what_there_is(tmp_path):
 
 def test_a_report_plays_nothing(tmp_path, monkeypatch):
     """Of runs beside which nothing was played, it says what to do."""
-    monkeypatch.setattr("jbrep.study.tables.play", None)
+    monkeypatch.setattr("jbrep.studies.tables.play", None)
     plan = make_study(tmp_path / "unplayed")
     monkeypatch.setattr(report, "study_plots", lambda found: [])
     made = make_report(plan.folder)
@@ -406,7 +414,7 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
     for _, name, episode, played in rows[1:]:
         alone = find_episode(policies[name], int(episode), task).reward.sum()
         assert float(played) == pytest.approx(alone, abs=1e-3)
-    monkeypatch.setattr("jbrep.study.tables.play", None)
+    monkeypatch.setattr("jbrep.studies.tables.play", None)
     write_tables(plan.folder)
     play_references(plan.folder)
     assert path.read_bytes() == before
@@ -444,7 +452,7 @@ def test_references_of_an_environment_that_is_not_here_stay(tmp_path, monkeypatc
     write_tables(plan.folder)
     write_policies(plan.folder, STUDY.replace(evaluation_episodes=1, final_episodes=1))
     before = read_tables(plan.folder).references
-    monkeypatch.setattr("jbrep.study.tables.play", away)
+    monkeypatch.setattr("jbrep.studies.tables.play", away)
     with pytest.warns(Notice, match="couldn't be played on face_direction: it isn't here"):
         play_references(plan.folder)
     assert read_tables(plan.folder).references == before

@@ -15,7 +15,7 @@ from command import jbrep, mistake, refused
 from gymnasium.envs.registration import EnvSpec
 from small import contents
 
-from jbrep.collect import collect
+from jbrep.collecting import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import find_problems
 from jbrep.encoders.wrapper import Encoded

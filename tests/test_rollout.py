@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jbrep.collect import collect
+from jbrep.collecting import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe

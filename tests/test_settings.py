@@ -19,7 +19,7 @@ from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import episode_returns
 from jbrep.errors import DamageError, InputError
 from jbrep.records import container
-from jbrep.report.tables import read_tables
+from jbrep.reporting.tables import read_tables
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.agent import evaluate, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, RUN, read_evaluations, read_run
@@ -29,9 +29,9 @@ from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_zip import load_zip
 from jbrep.rl.presets import sb3_class
 from jbrep.rl.settings import CLASSES
-from jbrep.study.config import as_study, read_study
-from jbrep.study.plan import Plan, read_plan
-from jbrep.study.tables import write_tables
+from jbrep.studies.config import as_study, read_study
+from jbrep.studies.plan import Plan, read_plan
+from jbrep.studies.tables import write_tables
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
 PINK = {"kind": "coloured", "beta": 1, "sigma": 0.2}

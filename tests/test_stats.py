@@ -10,7 +10,7 @@ from made_up import found_of
 from scipy import optimize, stats
 
 from jbrep.errors import InputError
-from jbrep.report.report import results_text
+from jbrep.reporting.report import results_text
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.analysis import aggregates, probability_of_improvement, to_plain
 from jbrep.stats.association import rank_correlation

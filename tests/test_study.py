@@ -31,21 +31,21 @@ from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.play.sources import find_player
-from jbrep.report.findings import Findings
-from jbrep.report.report import results_text
-from jbrep.report.tables import read_tables
+from jbrep.reporting.findings import Findings
+from jbrep.reporting.report import results_text
+from jbrep.reporting.tables import read_tables
 from jbrep.rl.files import CHECKPOINT, RUN, read_run
 from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.stats.rules import Rules
-from jbrep.study import prepare as prepare_module
-from jbrep.study.config import Data, Study, as_study, read_study
-from jbrep.study.forecast import forecast
-from jbrep.study.plan import PROGRESS, STUDY, Plan, read_plan
-from jbrep.study.prepare import check, prepare
-from jbrep.study.record import RunsRecord
-from jbrep.study.representations import ByName
-from jbrep.study.runner import Outcome, Progress, on_this_machine, run_study, work
-from jbrep.study.tables import (
+from jbrep.studies import prepare as prepare_module
+from jbrep.studies.config import Data, Study, as_study, read_study
+from jbrep.studies.forecast import forecast
+from jbrep.studies.plan import PROGRESS, STUDY, Plan, read_plan
+from jbrep.studies.prepare import check, prepare
+from jbrep.studies.record import RunsRecord
+from jbrep.studies.representations import ByName
+from jbrep.studies.runner import Outcome, Progress, on_this_machine, run_study, work
+from jbrep.studies.tables import (
     REFERENCE_RETURNS,
     RETURNS,
     read_curves,
@@ -164,7 +164,7 @@ def test_what_a_study_can_not_show_is_said_first(tmp_path, monkeypatch):
     few = TINY.replace(algorithms=("sac-wide",), seeds=(0,)).notices
     assert few[1].startswith("sac-wide learns from step 25,600 on: ")
     path = written(tmp_path, 'representations = ["full"]')
-    monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
+    monkeypatch.setattr("jbrep.studies.forecast.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
     assert "This study compares nothing: it has one" in told.stderr
     assert max(map(len, told.stderr.splitlines())) <= 80
@@ -172,7 +172,7 @@ def test_what_a_study_can_not_show_is_said_first(tmp_path, monkeypatch):
 
 def test_a_study_is_read_without_its_environments(tmp_path, monkeypatch):
     """Their package may be gone by then."""
-    monkeypatch.setattr("jbrep.study.plan.describe", None)
+    monkeypatch.setattr("jbrep.studies.plan.describe", None)
     settings = {**TINY.as_json(), "tasks": ["Robots/Gone-v0"], "environment": {"g": 1}}
     forge(tmp_path / STUDY, settings)
     plan = read_plan(tmp_path)
@@ -401,7 +401,7 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     shutil.copytree(done.folder_of(finished), plan.folder_of(finished))
     with monkeypatch.context() as patch:
         stop = iter((False, True)).__next__  # after its first rollout
-        patch.setattr("jbrep.study.runner.stop_requested", stop)
+        patch.setattr("jbrep.studies.runner.stop_requested", stop)
         assert work(plan.assigned(begun)) is None
     assert (plan.folder_of(begun) / CHECKPOINT).exists()
     reported = jbrep("report", out, "--json")
@@ -476,8 +476,8 @@ def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     path = written(tmp_path)
     out = shutil.copytree(done.folder, tmp_path / "out")
     shutil.rmtree(Plan(TINY, out).folder_of(done.cells[0]))
-    monkeypatch.setattr("jbrep.study.run_study", lambda *given: 1)
-    monkeypatch.setattr("jbrep.report.report.write_report", lambda found, out: [out])
+    monkeypatch.setattr("jbrep.studies.run_study", lambda *given: 1)
+    monkeypatch.setattr("jbrep.reporting.report.write_report", lambda found, out: [out])
     told = jbrep("study", path, "--out", out)
     assert told.exit_code == 1
     assert "Note: 1 run crashed: the same study in that folder tries again\n" in told.stderr
@@ -497,7 +497,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     """Its workers import the package; its report is made where that is missing."""
     path, out = written(tmp_path, *MIXED), tmp_path / "mixed"
     with monkeypatch.context() as once:
-        once.setattr("jbrep.report.report.write_report", lambda found, out: [out])
+        once.setattr("jbrep.reporting.report.write_report", lambda found, out: [out])
         told = jbrep("study", path, "--out", out, "--workers", 1, "--import", "robots")
     assert told.exit_code == 0, told.output
     monkeypatch.delitem(gymnasium.registry, robots.ID)

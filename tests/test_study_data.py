@@ -8,17 +8,17 @@ import pytest
 from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
 from test_study import TINY
 
-from jbrep.collect.policies import acts_on_observations
+from jbrep.collecting.policies import acts_on_observations
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import read_manifest
 from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.rl.policy_file import shipped_file
-from jbrep.study.config import Data, as_study
-from jbrep.study.forecast import made_first
-from jbrep.study.plan import Plan
-from jbrep.study.prepare import check, prepare
+from jbrep.studies.config import Data, as_study
+from jbrep.studies.forecast import made_first
+from jbrep.studies.plan import Plan
+from jbrep.studies.prepare import check, prepare
 
 TASK = "face_direction"
 MIXTURE = "uniform:0.4+heuristic:0.3+trained:0.3"
@@ -237,7 +237,7 @@ def test_what_is_made_first_is_counted(made, tmp_path):
 
 
 def test_a_dry_run_shows_what_is_made_first(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
+    monkeypatch.setattr("jbrep.studies.forecast.estimate", lambda run: 60)
     study = TINY.replace(data={"": Data(steps=300)})
     (tmp_path / "it.toml").write_text(study.toml())
     told = jbrep("study", tmp_path / "it.toml", "--out", tmp_path / "out", "--dry-run")

@@ -21,24 +21,24 @@ from jbrep.encoders import find, load, save
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
 from jbrep.errors import DamageError, InputError
-from jbrep.evaluate.evaluation import EVALUATION, Score
-from jbrep.evaluate.table import DIAGNOSTICS, read_diagnostics
+from jbrep.evaluation.evaluation import EVALUATION, Score
+from jbrep.evaluation.table import DIAGNOSTICS, read_diagnostics
 from jbrep.records.record import to_plain
-from jbrep.report.diagnostics import add_diagnostics
-from jbrep.report.findings import Findings
-from jbrep.report.report import commands
-from jbrep.report.tables import read_tables
-from jbrep.report.views import settings_tables
+from jbrep.reporting.diagnostics import add_diagnostics
+from jbrep.reporting.findings import Findings
+from jbrep.reporting.report import commands
+from jbrep.reporting.tables import read_tables
+from jbrep.reporting.views import settings_tables
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.policy import load_run
-from jbrep.study.config import Data, as_study
-from jbrep.study.forecast import forecast
-from jbrep.study.plan import Assigned, Plan, read_plan
-from jbrep.study.prepare import prepare
-from jbrep.study.record import EACH_ITS_OWN, RECORD
-from jbrep.study.runner import run_study, work
-from jbrep.study.tables import write_tables
+from jbrep.studies.config import Data, as_study
+from jbrep.studies.forecast import forecast
+from jbrep.studies.plan import Assigned, Plan, read_plan
+from jbrep.studies.prepare import prepare
+from jbrep.studies.record import EACH_ITS_OWN, RECORD
+from jbrep.studies.runner import run_study, work
+from jbrep.studies.tables import write_tables
 
 TASK = "face_direction"
 NET = "my_encoders:Net"
@@ -397,7 +397,7 @@ def test_a_worker_imports_the_modules_it_is_told_to(done, tmp_path, monkeypatch)
 
 def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "jbrep.study.forecast.estimate", lambda run: 60 if run.encoder == NET else 30
+        "jbrep.studies.forecast.estimate", lambda run: 60 if run.encoder == NET else 30
     )
     runs = forecast(Plan(done.study, tmp_path / "it"), 1).runs
     assert [seconds for _, seconds in runs[:5]] == [30, 30, 60, 30, 30]

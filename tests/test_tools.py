@@ -18,7 +18,7 @@ from jbrep.records.tables import write_rows
 from jbrep.rl import Run
 from jbrep.rl.files import EPISODES, Episode
 from jbrep.stats.association import rank_correlation
-from jbrep.study.tables import Return
+from jbrep.studies.tables import Return
 from jbrep.training.method import Learned
 
 ROOT = Path(__file__).parent.parent

@@ -10,10 +10,10 @@ import pytest
 from command import jbrep
 from small import contents, forge, settings
 
-from jbrep.collect import collect
-from jbrep.collect.backends import make_episodes
-from jbrep.collect.derive import derive
-from jbrep.collect.shards import Simulator
+from jbrep.collecting import collect
+from jbrep.collecting.backends import make_episodes
+from jbrep.collecting.derive import derive
+from jbrep.collecting.shards import Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import find_problems
 from jbrep.dataset.schema import joined

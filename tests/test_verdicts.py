@@ -12,16 +12,16 @@ from small import adopt
 
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
-from jbrep.report import report
-from jbrep.report.findings import Findings
-from jbrep.report.report import write_report
-from jbrep.report.tables import read_tables
-from jbrep.report.views import verdict_cells
-from jbrep.study.config import as_study
-from jbrep.study.plan import Plan
-from jbrep.study.record import RECORD
-from jbrep.study.runner import register_study
-from jbrep.study.tables import REFERENCE_RETURNS, play_references, write_tables
+from jbrep.reporting import report
+from jbrep.reporting.findings import Findings
+from jbrep.reporting.report import write_report
+from jbrep.reporting.tables import read_tables
+from jbrep.reporting.views import verdict_cells
+from jbrep.studies.config import as_study
+from jbrep.studies.plan import Plan
+from jbrep.studies.record import RECORD
+from jbrep.studies.runner import register_study
+from jbrep.studies.tables import REFERENCE_RETURNS, play_references, write_tables
 
 DOCS = Path(__file__).parent.parent / "docs" / "verdicts.md"
 
@@ -169,7 +169,7 @@ def test_rules_that_do_not_fit_the_study(changes, field):
 
 
 def test_a_dry_run_tells_what_could_be_found(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.study.forecast.estimate", lambda run: 60)
+    monkeypatch.setattr("jbrep.studies.forecast.estimate", lambda run: 60)
     (tmp_path / "it.toml").write_text(STUDY.toml())
     told = jbrep("study", tmp_path / "it.toml", "--dry-run", "--out", tmp_path / "out")
     assert told.exit_code == 0, told.output

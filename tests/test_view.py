@@ -7,9 +7,9 @@ import pytest
 from command import jbrep, mistake
 from test_controller import controller_of, difference_over_an_episode, randomised
 
-from jbrep.collect import collect
-from jbrep.collect.derive import derive_view
-from jbrep.collect.policies import Heuristic
+from jbrep.collecting import collect
+from jbrep.collecting.derive import derive_view
+from jbrep.collecting.policies import Heuristic
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.envs import Lanes, describe
 from jbrep.envs.names import import_modules

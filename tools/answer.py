@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 
 from jbrep.errors import InputError
 from jbrep.records.storage import write_whole
-from jbrep.report.figures.panels import PAGE, Look, Plot, reference, styles
-from jbrep.report.findings import Agents, Findings, Group
-from jbrep.report.tables import read_tables
+from jbrep.reporting.figures.panels import PAGE, Look, Plot, reference, styles
+from jbrep.reporting.findings import Agents, Findings, Group
+from jbrep.reporting.tables import read_tables
 from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, SUPPORTED
 from jbrep.text import interval
 

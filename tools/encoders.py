@@ -19,14 +19,14 @@ from jbrep.encoders.encoder import SUFFIX
 from jbrep.encoders.shipped import UNLEARNED
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.evaluate.evaluation import EVALUATION, Diagnostics, Evaluation
-from jbrep.evaluate.table import DIAGNOSTICS, Diagnosed, diagnostics_text, headline
+from jbrep.evaluation.evaluation import EVALUATION, Diagnostics, Evaluation
+from jbrep.evaluation.table import DIAGNOSTICS, Diagnosed, diagnostics_text, headline
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method, name_of
 from jbrep.records.document import read_document
 from jbrep.records.tables import write_text
-from jbrep.report.diagnostics import evaluated
-from jbrep.report.evaluation import evaluation_text
+from jbrep.reporting.diagnostics import evaluated
+from jbrep.reporting.evaluation import evaluation_text
 
 SHIPPED = Path(__file__).parent.parent / "jbrep" / "encoders" / "shipped"
 SIZES = (12, 8, 4)

@@ -3,12 +3,12 @@
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from jbrep.evaluate.evaluation import Evaluation
+from jbrep.evaluation.evaluation import Evaluation
 from jbrep.records.document import read_document
-from jbrep.report import write_report
-from jbrep.report.figures import encoder_plots, write
-from jbrep.report.findings import Findings
-from jbrep.report.tables import read_tables
+from jbrep.reporting import write_report
+from jbrep.reporting.figures import encoder_plots, write
+from jbrep.reporting.findings import Findings
+from jbrep.reporting.tables import read_tables
 
 RESULTS = Path("results")
 

@@ -20,7 +20,7 @@ from jbrep.rl.files import EPISODES, FINISHED, last_returns, read_evaluations, r
 from jbrep.rl.policy import load_run, pack
 from jbrep.rl.policy_file import COLUMNS, FOLDER, RETURNS, SHIPPED, Returns, shipped, shipped_file
 from jbrep.stats.scale import LOOKING, STILL
-from jbrep.study.tables import References, read_tables
+from jbrep.studies.tables import References, read_tables
 
 COUNTED = 100  # episodes
 LAST = 64  # episodes of training, one of each robot

@@ -4,9 +4,9 @@ import sys
 from pathlib import Path
 
 from jbrep.records.storage import exclusive
-from jbrep.study import Plan, read_study
-from jbrep.study.prepare import check, prepare
-from jbrep.study.runner import usual_workers
+from jbrep.studies import Plan, read_study
+from jbrep.studies.prepare import check, prepare
+from jbrep.studies.runner import usual_workers
 
 
 def main(file: Path, folder: Path) -> None:

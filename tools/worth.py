@@ -25,14 +25,14 @@ import numpy as np
 
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
-from jbrep.evaluate.evaluation import EVALUATION, Evaluation
-from jbrep.evaluate.table import headline
+from jbrep.evaluation.evaluation import EVALUATION, Evaluation
+from jbrep.evaluation.table import headline
 from jbrep.records.document import read_document
-from jbrep.report.evaluation import judge
-from jbrep.report.tables import Tables, read_tables
+from jbrep.reporting.evaluation import judge
+from jbrep.reporting.tables import Tables, read_tables
 from jbrep.stats.association import correlation_of_ranks, over_families
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.study.tables import by_run
+from jbrep.studies.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, interval, number
 
 SCORES, LEARNED = "scores", "learned.csv"

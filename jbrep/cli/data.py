@@ -89,7 +89,7 @@ def verify(
     Args:
         replay: episodes to simulate again and compare bit for bit.
     """
-    from jbrep.collect.replay import replay_problems
+    from jbrep.collecting.replay import replay_problems
     from jbrep.dataset import Dataset
     from jbrep.dataset.manifest import find_problems
 
@@ -119,7 +119,7 @@ def _say_all(lines: Iterable[str]) -> bool:
 @command("data repair data/face")
 def repair(data: Path, /, *, lanes: Lanes = 100, threads: Threads = None) -> None:
     """Make damaged and missing shards again from their seeds."""
-    from jbrep.collect.replay import repair as run
+    from jbrep.collecting.replay import repair as run
     from jbrep.play.sources import kept_policy
 
     with stoppable(RESUMES):
@@ -155,8 +155,8 @@ def derive(
         reward: for rewards (n,) of the observations (n, d) and actions (n, k) of an episode; is
             run.
     """
-    from jbrep.collect.derive import derive as run
-    from jbrep.collect.derive import derive_view
+    from jbrep.collecting.derive import derive as run
+    from jbrep.collecting.derive import derive_view
     from jbrep.envs.names import is_code
 
     if bool(task) == (bool(hide or reward) or history > 1):

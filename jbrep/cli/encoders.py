@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from jbrep.encoders import Encoder
     from jbrep.encoders.base import BaseEncoder
     from jbrep.envs.task import Task
-    from jbrep.evaluate.evaluation import Evaluation
-    from jbrep.evaluate.table import Values
+    from jbrep.evaluation.evaluation import Evaluation
+    from jbrep.evaluation.table import Values
 
 
 _LETTERS = 100  # of the name of a folder
@@ -54,10 +54,10 @@ def evaluate(
     whole = Dataset(data)
     for name in encoders:
         check_found(name, whole.task)
-    from jbrep.evaluate.evaluation import EVALUATION  # imports torch
-    from jbrep.report.evaluation import evaluation_text
-    from jbrep.report.figures import encoder_plots
-    from jbrep.report.figures import write as write_plots
+    from jbrep.evaluation.evaluation import EVALUATION  # imports torch
+    from jbrep.reporting.evaluation import evaluation_text
+    from jbrep.reporting.figures import encoder_plots
+    from jbrep.reporting.figures import write as write_plots
 
     found = find_all(encoders, whole.task)
     sources = {
@@ -158,7 +158,7 @@ def _plain(name: str, encoder: "Encoder", known: "Values") -> dict[str, Any]:
 def _with_diagnostics(task: "Task") -> "list[tuple[str, Encoder, Values]]":
     """The encoders that ship for a task, with what is known of each."""
     from jbrep.encoders.shipped import shipped, shipped_folder
-    from jbrep.evaluate.table import DIAGNOSTICS, read_diagnostics
+    from jbrep.evaluation.table import DIAGNOSTICS, read_diagnostics
 
     rows = read_diagnostics(shipped_folder(task) / DIAGNOSTICS)
     known = {row.sha256: row.values for row in rows}

@@ -13,10 +13,10 @@ from jbrep.parameters import AsJson, Backend, Workers
 from jbrep.text import Table, duration, terminal_width
 
 if TYPE_CHECKING:
-    from jbrep.report.report import Report
-    from jbrep.report.views import Cells
+    from jbrep.reporting.report import Report
+    from jbrep.reporting.views import Cells
     from jbrep.stats.rules import Planned
-    from jbrep.study.forecast import Forecast
+    from jbrep.studies.forecast import Forecast
 
 
 @command("study studies/demo.toml --out runs/demo")
@@ -53,7 +53,7 @@ def study(
     if not exists(study):
         raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)
-    from jbrep.study.runner import BACKENDS  # imports torch
+    from jbrep.studies.runner import BACKENDS  # imports torch
 
     choose(backend, BACKENDS, "backend")
     if dry_run and backend != "local":
@@ -70,9 +70,9 @@ def study(
 
 def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> None:
     """Say what a study is going to do, or write it down before the first run."""
-    from jbrep.study import Plan, read_study, register_study
-    from jbrep.study.forecast import forecast
-    from jbrep.study.plan import registration_in
+    from jbrep.studies import Plan, read_study, register_study
+    from jbrep.studies.forecast import forecast
+    from jbrep.studies.plan import registration_in
 
     plan = Plan(read_study(path), folder, path)
     expected = forecast(plan, workers) if dry_run else None
@@ -90,7 +90,7 @@ def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> N
 
 def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
     """The runs to go, how long they would take, and what could be found of its claims."""
-    from jbrep.report.views import in_text, probability, say
+    from jbrep.reporting.views import in_text, probability, say
     from jbrep.stats.power import BETTER_BY, EARLIER_BY, SDS
 
     to_go: dict[str, list[float]] = {}
@@ -148,7 +148,7 @@ def report(
 
 
 def _show(made: "Report", everything: bool = False, as_json: bool = False) -> None:
-    from jbrep.report.report import results_text
+    from jbrep.reporting.report import results_text
 
     if not as_json:
         say(results_text(made.findings, terminal_width(), everything))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collect.replay import simulate_again
+from jbrep.collecting.replay import simulate_again
 from jbrep.dataset import Dataset, Episode
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.physics import Motion, MotionReader

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from jbrep.collect.policies import POLICIES, Policy, make_policy, parse_policy
+from jbrep.collecting.policies import POLICIES, Policy, make_policy, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import FULL
@@ -23,7 +23,7 @@ from jbrep.rl.files import POLICY, POLICY_ZIP, check_begun, is_policy_file, is_r
 from jbrep.rl.policy_file import SHIPPED, find_shipped
 
 if TYPE_CHECKING:
-    from jbrep.evaluate.control import GoodPolicy
+    from jbrep.evaluation.control import GoodPolicy
     from jbrep.rl.policy import Trained
 
 _HEURISTIC = "heuristic"  # the Jitterbug's hand-written policy
@@ -161,7 +161,7 @@ def find_good_policy(
         raise InputError(
             f"policy {source} doesn't act on what it observes: give {_HEURISTIC} or a run's folder"
         )
-    from jbrep.evaluate.control import GoodPolicy, PlayedEpisode  # imports torch
+    from jbrep.evaluation.control import GoodPolicy, PlayedEpisode  # imports torch
 
     player = find_player(source, task)
 

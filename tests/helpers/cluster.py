@@ -10,9 +10,9 @@ from pathlib import Path
 import ray
 from ray.cluster_utils import Cluster
 
-from jbrep.collect import collect
-from jbrep.study.plan import PROGRESS, Plan
-from jbrep.study.runner import on_ray, run_study
+from jbrep.collecting import collect
+from jbrep.studies.plan import PROGRESS, Plan
+from jbrep.studies.runner import on_ray, run_study
 
 NODE = {"num_cpus": 1, "include_dashboard": False, "include_log_monitor": False}
 CONFIG = {

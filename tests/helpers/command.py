@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from jbrep.cli import main
 from jbrep.errors import InputError
-from jbrep.study.runner import work
+from jbrep.studies.runner import work
 
 
 def jbrep(*arguments):

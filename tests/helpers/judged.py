@@ -1,6 +1,6 @@
 """Made-up evaluations of encoders."""
 
-from jbrep.evaluate.evaluation import (
+from jbrep.evaluation.evaluation import (
     Diagnostics,
     Evaluation,
     JudgedOn,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from small import contents, settings
 
-from jbrep.collect import collect
+from jbrep.collecting import collect
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.envs import describe

@@ -10,8 +10,8 @@ from jbrep.encoders import find, save
 from jbrep.encoders.vec_env import agent_spaces
 from jbrep.records import container
 from jbrep.records.tables import write_rows
-from jbrep.report.figures.panels import PAPER
-from jbrep.report.findings import Findings, RunFound, groups_of
+from jbrep.reporting.figures.panels import PAPER
+from jbrep.reporting.findings import Findings, RunFound, groups_of
 from jbrep.rl.agent import Spaces, make_agent, parameters
 from jbrep.rl.checkpoint import Header
 from jbrep.rl.files import (
@@ -27,8 +27,8 @@ from jbrep.rl.files import (
 from jbrep.rl.overrides import check_shape
 from jbrep.rl.training import packages
 from jbrep.stats.analysis import to_plain
-from jbrep.study.config import as_study
-from jbrep.study.plan import Plan
+from jbrep.studies.config import as_study
+from jbrep.studies.plan import Plan
 
 COMMITS = {"jbrep": "1" * 40}
 STILL = 250
@@ -121,7 +121,7 @@ def of_a_commit():
     """Code and registrations are of a commit in here, also where a contributor has changed some."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Plan, "in_git", True)
-        for module in ("jbrep.study.plan", "jbrep.rl.training"):
+        for module in ("jbrep.studies.plan", "jbrep.rl.training"):
             patch.setattr(f"{module}.commits", lambda: COMMITS)
         yield
 

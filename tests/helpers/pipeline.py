@@ -11,9 +11,9 @@ import pytest
 from command import in_this_process, jbrep, start, wait_for, wait_for_the_end_of, workers_of
 from small import contents
 
-from jbrep.report.report import MARKDOWN
-from jbrep.study.runner import BACKENDS
-from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
+from jbrep.reporting.report import MARKDOWN
+from jbrep.studies.runner import BACKENDS
+from jbrep.studies.tables import REFERENCE_RETURNS, RETURNS
 
 STUDY = """
 tasks = ["face_direction"]
@@ -54,7 +54,7 @@ def in_peace(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(BACKENDS, "local", in_this_process)
         with pytest.MonkeyPatch.context() as once:
-            once.setattr("jbrep.report.report.write_report", lambda found, out: [out])
+            once.setattr("jbrep.reporting.report.write_report", lambda found, out: [out])
             said = {stage: jbrep(*given).output for stage, given in stages(folder).items()}
         return said | {"report": jbrep("report", folder / "study").output}
 

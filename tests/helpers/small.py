@@ -3,8 +3,8 @@
 import hashlib
 import json
 
-from jbrep.collect import write_shards
-from jbrep.collect.derive import _each_shard
+from jbrep.collecting import write_shards
+from jbrep.collecting.derive import _each_shard
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import read_manifest
 from jbrep.envs import describe

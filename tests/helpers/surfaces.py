@@ -13,24 +13,24 @@ from rerun.chunk import RrdReader
 from small import brief
 
 from jbrep.cli import main
-from jbrep.collect import collect
+from jbrep.collecting import collect
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export, open_sources
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.envs.names import environment_versions
-from jbrep.report import make_report
-from jbrep.report.report import MARKDOWN
-from jbrep.report.tables import read_tables
+from jbrep.reporting import make_report
+from jbrep.reporting.report import MARKDOWN
+from jbrep.reporting.tables import read_tables
 from jbrep.rl import Run, Session, train
 from jbrep.rl.checkpoint import Checkpoint
 from jbrep.rl.files import CHECKPOINT, ENCODER, EVALUATIONS, POLICY, RUN
 from jbrep.rl.tune import BEST, SEARCH
-from jbrep.study.config import Study
-from jbrep.study.plan import REGISTRATION, Plan, find_committed, registration_in
-from jbrep.study.record import RECORD
-from jbrep.study.runner import run_study
-from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
+from jbrep.studies.config import Study
+from jbrep.studies.plan import REGISTRATION, Plan, find_committed, registration_in
+from jbrep.studies.record import RECORD
+from jbrep.studies.runner import run_study
+from jbrep.studies.tables import REFERENCE_RETURNS, RETURNS
 
 PENDULUM = describe("Pendulum-v1", max_episode_steps=20)
 environment_versions(PENDULUM)  # or every fork looks through the files of all packages

@@ -6,7 +6,7 @@ from pathlib import Path
 import environments
 import gymnasium
 
-from jbrep.collect import collect
+from jbrep.collecting import collect
 from jbrep.dataset import DataSettings
 from jbrep.envs import describe
 

@@ -63,7 +63,7 @@ def _resampled(
     values = np.column_stack(signals)
     known = np.isfinite(values)
     if not (has_some := known.any(axis=0)).all():
-        silent = listed([leaves[i].name for i in np.flatnonzero(~has_some)])
+        silent = listed([leaves[i].name for i in np.flatnonzero(~has_some).tolist()])
         counts["row", f"of episodes without a reading of {silent}: left out"] += len(time)
         return
     begin = time[known.argmax(axis=0)].max()

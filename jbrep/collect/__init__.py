@@ -1,5 +1,0 @@
-"""Collecting data sets: policies, the collector, and what makes shards again or anew."""
-
-from jbrep.collect.collector import collect, write_shards
-
-__all__ = ["collect", "write_shards"]

@@ -1,0 +1,170 @@
+"""Where episodes are made: in this process, in others on this machine, or on a Ray cluster."""
+
+import math
+import pickle
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
+
+from jbrep.collecting.shards import Growth, Produce, Simulator
+from jbrep.dataset.schema import Columns
+from jbrep.envs.make import close_kept, is_batched
+from jbrep.envs.names import import_modules, imported_modules, spec_of
+from jbrep.envs.recording import Tick
+from jbrep.errors import InputError, first_line
+from jbrep.machine import cores
+from jbrep.pool import ATTEMPTS, on_cluster, side_by_side, stop_requested
+
+_PIECES = 10  # of a shard: what a worker makes at a time
+_AHEAD = 4  # pieces for each worker, begun or held until those before are made
+_PATIENCE = 60.0  # seconds, until pieces under way have stopped
+Made = list[Columns | InputError]  # episodes, and what ended them early
+
+
+def local(simulator: Simulator) -> Produce:
+    """A batch's episodes in turn on threads; other environments' side by side in processes."""
+    workers = simulator.num_threads or cores()
+    task = simulator.settings.task
+    if is_batched(task) or workers == 1 or not _can_be_sent(spec_of(task), simulator):
+        return simulator.in_turn
+    return _in_processes(replace(simulator, lanes=1, num_threads=1), workers)
+
+
+def _can_be_sent(*parts: Any) -> bool:
+    """Whether other processes can make what this one has, though they don't run its script.
+
+    They can't make classes of a script or notebook, which stand in `__main__`.
+    """
+    try:
+        return b"__main__" not in pickle.dumps(parts)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return False
+
+
+class _Ahead:
+    """The pieces of a data set that are made side by side: of a shard each, in order.
+
+    Attributes:
+        waiting: those that were begun and aren't given yet, or what stands for them.
+    """
+
+    def __init__(self, growth: Growth):
+        self.waiting = deque[Any]()
+        self._growth, self._begin = growth, growth.episodes
+        self._each = growth.manifest.settings.shard_episodes
+
+    def next(self, most: int) -> range | None:
+        """The episodes to begin beside those that wait, most of them at a time; None if none."""
+        if self.waiting and (len(self.waiting) >= most or not self._growth.wants(self._begin)):
+            return None
+        begin, end = self._begin, (self._begin // self._each + 1) * self._each
+        self._begin = min(begin + math.ceil(self._each / _PIECES), end)
+        return range(begin, self._begin)
+
+
+def _in_processes(simulator: Simulator, workers: int) -> Produce:
+    """Pieces made side by side, given in order; one whose worker is killed is made again."""
+
+    def produce(growth: Growth, tick: Tick) -> Iterator[Columns]:
+        each = simulator.settings.shard_episodes
+        if not growth.wants((growth.episodes // each + 1) * each):  # one shard alone
+            yield from simulator.in_turn(growth, tick)
+            return
+        ahead, made = _Ahead(growth), dict[range, Made]()
+        known = imported_modules(), spec_of(simulator.settings.task)
+        close_kept()  # the workers have their own
+
+        def next_piece() -> range | None:
+            if coming := ahead.next(_AHEAD * workers):
+                ahead.waiting.append(coming)
+            return coming
+
+        make = partial(make_episodes, known, simulator)
+        with closing(side_by_side(make, next_piece, workers, _PATIENCE)) as pieces:
+            for piece, result in pieces:
+                if result is None:
+                    raise InputError(
+                        f"the worker that began with episode {piece.start} was killed "
+                        f"{ATTEMPTS} times, perhaps because memory ran out: try fewer --threads"
+                    )
+                made[piece] = result
+                while ahead.waiting and ahead.waiting[0] in made:
+                    yield from _whole(made.pop(ahead.waiting.popleft()))
+
+    return produce
+
+
+def make_episodes(
+    known: tuple[tuple[str, ...], EnvSpec], simulator: Simulator, episodes: range
+) -> Made:
+    """Make some episodes, in a process of its own.
+
+    Args:
+        known: modules to import, and what the environment is, if none of them registers it.
+        simulator: makes them.
+        episodes: of one shard.
+    """
+    modules, spec = known
+    made: Made = []
+    try:
+        import_modules(modules)
+        gymnasium.registry.setdefault(spec.id, spec)
+        for block in simulator.made(episodes, _stop_on_request):
+            made.append(block)
+    except InputError as error:
+        made.append(InputError(str(error)))  # which can be sent
+    return made
+
+
+def _whole(made: Made) -> Iterator[Columns]:
+    """What was made, and then the failure."""
+    for each in made:
+        if isinstance(each, InputError):
+            raise each
+        yield each
+
+
+def _stop_on_request(steps: int) -> None:
+    if stop_requested():
+        raise SystemExit
+
+
+def on_ray(simulator: Simulator) -> Produce:
+    """Pieces made side by side on the Ray cluster that RAY_ADDRESS names, or else on a local one.
+
+    Only this process writes to the data set's folder. The pieces of a node that dies are made
+    again on another.
+    """
+
+    def produce(growth: Growth, tick: Tick) -> Iterator[Columns]:
+        import ray
+
+        make = on_cluster(make_episodes, simulator.num_threads)
+        alone = replace(simulator, lanes=1, num_threads=1)
+        known = imported_modules(), spec_of(simulator.settings.task)
+        ahead = _Ahead(growth)
+        try:
+            while True:
+                most = _AHEAD * int(ray.cluster_resources().get("CPU", 1))
+                while coming := ahead.next(most):
+                    ahead.waiting.append(make.remote(known, alone, coming))
+                made = ray.get(ahead.waiting[0])
+                ahead.waiting.popleft()
+                yield from _whole(made)
+        except ray.exceptions.RayError as error:
+            reason = first_line(error)
+            raise InputError(f"the cluster could not make episodes: {reason}") from error
+        finally:
+            for job in ahead.waiting:
+                ray.cancel(job, force=True)
+
+    return produce
+
+
+BACKENDS: dict[str, Callable[[Simulator], Produce]] = {"local": local, "ray": on_ray}

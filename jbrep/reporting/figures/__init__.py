@@ -1,0 +1,7 @@
+"""Figures, drawn from the tables that the other stages write."""
+
+from jbrep.reporting.figures.encoders import encoder_plots
+from jbrep.reporting.figures.panels import Plot, write
+from jbrep.reporting.figures.study import study_plots
+
+__all__ = ["Plot", "encoder_plots", "study_plots", "write"]

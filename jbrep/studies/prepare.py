@@ -1,0 +1,311 @@
+"""The data sets and encoders that a study's runs need."""
+
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from jbrep.collecting import collect
+from jbrep.collecting.collector import usual_shard_episodes
+from jbrep.collecting.derive import derive
+from jbrep.collecting.policies import Policy, acts_on_observations
+from jbrep.dataset import Dataset, DataSettings
+from jbrep.dataset.manifest import MANIFEST, read_manifest
+from jbrep.dataset.settings import TRAINED, parts_of
+from jbrep.encoders import FULL
+from jbrep.encoders.shipped import UNLEARNED, find, names
+from jbrep.envs.names import import_modules, imported_modules, is_code
+from jbrep.envs.task import Task, check_same
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import TASKS
+from jbrep.machine import cores
+from jbrep.methods.fit import Fitter
+from jbrep.methods.registry import get_method
+from jbrep.play.sources import find_policy
+from jbrep.pool import ATTEMPTS, side_by_side
+from jbrep.records.storage import exists
+from jbrep.rl import Run
+from jbrep.studies.config import Data, data_key
+from jbrep.studies.plan import Plan
+from jbrep.studies.representations import ByName
+
+
+def check(plan: Plan) -> None:
+    """Check, before anything is collected or trained, that the runs can start."""
+    for each in every_made(plan):
+        if each.data.folder:
+            given = Dataset(each.folder).task
+            check_same(plan.task(each.task), given, f"the data set {each.folder}")
+            each.fitter()
+        else:
+            each.to_collect()
+    for name in plan.study.tasks:
+        task = plan.task(name)
+        for representation in by_name(plan):
+            _check_by_name(plan, representation, task)
+    _check_own(plan)
+    of_each = {(cell.task, repr(cell.learner)): cell for cell in plan.cells}
+    for cell in of_each.values():  # the representation decides no setting of a learner
+        run = plan.run(cell).replace(encoder=FULL)
+        run.settings(run.find_encoder())
+
+
+def by_name(plan: Plan) -> list[ByName]:
+    """The representations that the study makes, or that ship."""
+    return [each for each in plan.study.observed if isinstance(each, ByName)]
+
+
+def _check_by_name(plan: Plan, representation: ByName, task: Task) -> None:
+    """Check that an encoder ships for a task, or can be made for it."""
+    largest = get_method(representation.kind).largest(task.size)
+    if plan.study.data is not None:
+        if largest is not None and representation.training.get("latent", 0) > largest:
+            raise InputError(
+                f"{representation.name} has more numbers than the {task.size} features of "
+                f"{task.name} allow: choose a latent size of at most {largest}"
+            )
+    elif representation.name in UNLEARNED:
+        find(representation.name, task)  # may refuse the task
+    elif representation.name not in (shipped := names(task) or (FULL,)):
+        raise InputError(
+            f"no encoder {representation.name!r} ships for {task.name}: choose one of "
+            f"{', '.join(shipped)}, or let the study train it, on the states that [data] gives"
+        )
+
+
+def _check_own(plan: Plan) -> None:
+    """Check the user's own encoders, each once for each task."""
+    checked = set()
+    for cell in plan.cells:
+        if isinstance(cell.representation, ByName):
+            continue
+        try:
+            run = plan.run(cell)
+            if (cell.task, run.encoder) not in checked:
+                checked.add((cell.task, run.encoder))
+                _check_encoder(run)
+        except InputError as error:
+            raise InputError(f"run {cell.name} can't start: {error}") from None
+
+
+def _check_encoder(run: Run) -> None:
+    if not is_code(run.encoder) and not exists(run.encoder):
+        raise InputError(f"its encoder {run.encoder} is missing")
+    encoder = run.find_encoder()
+    if is_code(run.encoder) and run.find_encoder().fingerprint != encoder.fingerprint:
+        raise InputError(
+            f"{run.encoder} makes another encoder each time: let it load its weights, or seed it"
+        )
+
+
+@dataclass(frozen=True)
+class Made:
+    """A data set that a study needs for a task, and the encoders that are made from it.
+
+    Attributes:
+        plan: the study.
+        task: its name.
+        name: of the data; empty for those of the only table.
+        number: of several data sets.
+    """
+
+    plan: Plan = field(compare=False)
+    task: str
+    name: str
+    number: int
+
+    def __str__(self) -> str:
+        several = f", set {self.number}" if self.plan.study.sets(self.name) > 1 else ""
+        return f"{data_key(self.name)} of {self.task}{several}"
+
+    @property
+    def data(self) -> Data:
+        """What the study says of it."""
+        return self.plan.study.named_data[self.name]
+
+    @property
+    def folder(self) -> Path:
+        """Where it is."""
+        if self.data.folder:
+            return self.data.existing(self.task)
+        return self.plan.data(self.task, self.number, self.name)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it exists, or is collected to its end."""
+        if self.data.folder:
+            return True
+        if not exists(self.folder / MANIFEST):
+            return False
+        manifest = read_manifest(self.folder)
+        return manifest.complete and manifest.settings.steps == self.data.steps
+
+    @property
+    def is_made(self) -> bool:
+        """Whether it is complete, and its encoders are trained to the end."""
+        if not self.is_complete:
+            return False
+        fitter = self.fitter()
+        return all(
+            fitter.plan(kind, name=name, **settings).is_complete()
+            for name, kind, settings in self.fits()
+        )
+
+    def fits(self) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+        """Names, kinds and settings of the encoders that are made from it."""
+        study = self.plan.study
+        for each in by_name(self.plan):
+            if study.data_of(each) == self.name:
+                for name, settings in each.fits[self.number :: study.sets(self.name)]:
+                    yield name, each.kind, settings
+
+    def fitter(self) -> Fitter:
+        """What makes its encoders, which are checked."""
+        fitter = Fitter(self.folder, self.plan.encoders(self.task))
+        for name, kind, settings in self.fits():
+            try:
+                fitter.plan(kind, name=name, **settings)
+            except InputError as error:
+                raise InputError(f"{name} can't be trained for {self.task}: {error}") from None
+        return fitter
+
+    def policy(self) -> Policy:
+        """The policy that collects it; that of a run stays as the data set has it."""
+        task = self.plan.task(self.task).undisturbed
+        try:
+            policy = find_policy(self.data.policy, self.folder, task)
+            policy.begin(task, [0])  # may refuse the task
+        except InputError as error:
+            raise InputError(f"{data_key(self.name)}.policy for {self.task}: {error}") from None
+        return policy
+
+    def to_collect(self) -> tuple[DataSettings, Policy]:
+        """Its settings, with states where the task has them, and its policy."""
+        task, policy = self.plan.task(self.task).undisturbed, self.policy()
+        settings = DataSettings(
+            task=task,
+            policy=policy.settings(),
+            steps=self.data.steps,
+            seed=self.data.seed + self.number,
+            store_state=bool(task.state),
+        )
+        return settings, policy
+
+    def source(self) -> "Made | None":
+        """What it is derived from; None where it is collected or exists.
+
+        The Jitterbug's tasks share their motion, unless the policy acts on what it observes.
+        """
+        if self.task not in TASKS or self.data.folder:
+            return None
+        if acts_on_observations(self.policy().settings()):
+            return None
+        first = next(name for name in self.plan.study.tasks if name in TASKS)
+        sources = (replace(self, task=name) for name in TASKS)
+        collected = next((each for each in sources if each.has_states), replace(self, task=first))
+        return None if collected == self else collected
+
+    @property
+    def has_states(self) -> bool:
+        """Whether it is there, at least in part, with the states of the simulation."""
+        manifest = self.folder / MANIFEST
+        return exists(manifest) and read_manifest(self.folder).settings.store_state
+
+    def make(self, source: "Made | None", threads: int | None) -> None:
+        """Collect or derive it on some threads, and train its encoders; None takes every core."""
+        if not self.is_complete:
+            if source:
+                derive(source.folder, self.task, self.folder, num_threads=threads)
+            else:
+                settings, policy = self.to_collect()
+                episodes = usual_shard_episodes(settings, self.folder, policy)
+                settings = settings.replace(shard_episodes=episodes)
+                collect(settings, self.folder, num_threads=threads, policy=policy)
+            say(f"{self}: {read_manifest(self.folder).rows:,} states")
+        fitter = self.fitter()
+        for name, kind, given in self.fits():
+            if fitter.fit(kind, name=name, **given).is_new:
+                say(f"{self}: encoder {name}")
+
+
+def every_made(plan: Plan) -> list[Made]:
+    """All data sets of a study."""
+    return [
+        Made(plan, task, name, number)
+        for task in plan.study.tasks
+        for name in plan.study.named_data
+        for number in range(plan.study.sets(name))
+    ]
+
+
+def policies(plan: Plan) -> dict[str, str]:
+    """SHA-256 of the files of policies that are going to collect data, as `Plan.policies`."""
+    return {
+        f"{each.folder.relative_to(plan.folder)}/{part['file']}": part["sha256"]
+        for each in every_made(plan)
+        if not each.data.folder
+        for part in parts_of(each.policy().settings())
+        if part["kind"] == TRAINED
+    }
+
+
+def say(line: str) -> None:
+    """Print a line on standard error, above a live table; a study goes on where that fails."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(line, file=sys.stderr, flush=True)
+
+
+def prepare(plan: Plan, workers: int = 1) -> None:
+    """Collect the data sets and train the encoders that don't exist yet.
+
+    What is made doesn't depend on how many workers make it. Stopped, it goes on where it was.
+
+    Args:
+        plan: the study.
+        workers: how many processes go on at a time.
+    """
+    sources = {each: each.source() for each in every_made(plan)}
+    waiting = [each for each in sources if not each.is_made]
+    waiting.sort(key=lambda each: sources[each] is not None)  # what others are derived from first
+    workers = min(workers, cores(), len(waiting))
+    if workers < 2:
+        for each in waiting:
+            each.make(sources[each], None)
+        return
+    under_way = set[Made]()
+
+    def next_job() -> tuple[Made, Made | None] | None:
+        missing = under_way.union(waiting)
+        for each in waiting:
+            if sources[each] not in missing:
+                waiting.remove(each)
+                under_way.add(each)
+                return each, sources[each]
+        return None
+
+    make = partial(_make, max(1, cores() // workers), imported_modules())
+    with closing(side_by_side(make, next_job, workers)) as made:
+        for (each, _), mistake in made:
+            under_way.remove(each)
+            if mistake:
+                raise InputError(mistake)
+            if mistake is None:
+                raise InputError(
+                    f"the worker that makes {each} was killed {ATTEMPTS} times, perhaps because "
+                    "memory ran out: try fewer --workers"
+                )
+
+
+def _make(threads: int, modules: Iterable[str], job: tuple[Made, Made | None]) -> str:
+    """Make a data set and its encoders, in a worker; what a user did wrong."""
+    made, source = job
+    try:
+        import_modules(modules)
+        made.make(source, threads)
+        return ""
+    except InputError as error:
+        return str(error)

@@ -1,0 +1,289 @@
+"""A study from start to end: its runs side by side, on this machine or on a Ray cluster."""
+
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable
+from contextlib import AbstractContextManager, closing, nullcontext
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from jbrep.envs.names import import_modules, imported_modules
+from jbrep.errors import first_line
+from jbrep.machine import cores
+from jbrep.pool import ATTEMPTS, on_cluster, side_by_side, stop_requested
+from jbrep.records.storage import exclusive, exists, make_folder, write_note
+from jbrep.rl import Session, StoppedError, train
+from jbrep.rl.files import FAILED, FINISHED, read_run, runs_below
+from jbrep.rl.history import History
+from jbrep.rl.settings import CPU, CUDA
+from jbrep.rl.training import drop_checkpoint, standing_of
+from jbrep.studies.plan import (
+    PROGRESS,
+    REGISTRATION,
+    STUDY,
+    Assigned,
+    Cell,
+    Plan,
+    beside,
+    find_committed,
+    registration_in,
+)
+from jbrep.studies.prepare import check, policies, prepare, say
+from jbrep.studies.tables import REFERENCE_RETURNS, play_references, write_tables
+from jbrep.text import duration, rounded
+
+ERROR = "error.txt"  # the traceback of a run that crashed
+CRASHED = "crashed"
+_OWN = STUDY, REGISTRATION, REFERENCE_RETURNS, "data", "encoders", "runs"  # see `make_folder`
+_PATIENCE = 60.0  # seconds, until runs have written their checkpoints
+_WRITE_EVERY = 1.0  # seconds
+
+
+class Outcome(NamedTuple):
+    """How a run ended."""
+
+    name: str
+    status: str  # finished, failed or crashed
+    message: str  # the reason, or how long it took
+
+
+def work(assigned: Assigned, modules: Iterable[str] = ()) -> Outcome | None:
+    """Train a run; an error is reported in its outcome and stops no other run.
+
+    Args:
+        assigned: the run.
+        modules: to import first, as they register environments.
+
+    Returns:
+        How the run ended; None if it was stopped.
+    """
+    try:
+        make_folder(assigned.folder)
+        import_modules(modules)
+        watch = _ProgressFile(assigned.folder, assigned.run.steps)
+        result = train(assigned.run, assigned.folder, Session(watch, stop=stop_requested))
+    except StoppedError:
+        return None
+    except Exception as error:
+        return _crashed(assigned, error)
+    for leftover in (PROGRESS, ERROR):
+        (assigned.folder / leftover).unlink(missing_ok=True)
+    message = result.reason or f"{result.seconds / 60:.1f} min"
+    return Outcome(assigned.name, result.status, message)
+
+
+def _crashed(assigned: Assigned, error: Exception) -> Outcome:
+    path = assigned.folder / ERROR
+    write_note(path, "".join(traceback.format_exception(error)))
+    return Outcome(assigned.name, CRASHED, f"{first_line(error)}; see {path}")
+
+
+class _ProgressFile:
+    """Tells the parent process, through a file, how far a run is."""
+
+    def __init__(self, folder: Path, steps: int) -> None:
+        self._path, self._steps, self._written = folder / PROGRESS, steps, 0.0
+
+    def __call__(self, history: History, step: int) -> None:
+        now = time.monotonic()
+        if step >= self._steps or now - self._written >= _WRITE_EVERY:
+            shown = rounded(history.means[-1])[0] if history.evaluations else "-"
+            write_note(self._path, f"{step} {shown}")
+            self._written = now
+
+
+Backend = Callable[[Plan, Iterable[Cell], int], Generator[Outcome]]
+
+
+def usual_workers(plan: Plan) -> int:
+    """How many runs go on at a time: one for each core, or one that has a GPU and all cores."""
+    return cores() if plan.device == CPU else 1
+
+
+def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
+    """Bring runs to their end in processes of one thread each; yield the outcomes as they come.
+
+    A run whose worker is killed is resumed from its checkpoint by another, up to five times. Closed
+    early, this waits until the runs under way have written their checkpoints.
+    """
+    jobs = map(plan.assigned, cells)
+    train = partial(work, modules=imported_modules())
+    ended = side_by_side(
+        train, lambda: next(jobs, None), workers, _PATIENCE, stopping=_announce_stop
+    )
+    with closing(ended):
+        for job, outcome in ended:
+            yield outcome or _killed(job.name)
+
+
+def _announce_stop() -> None:
+    say("stopping: the runs under way write their checkpoints; Ctrl-C again ends them at once")
+
+
+def _killed(name: str) -> Outcome:
+    reason = f"its worker was killed {ATTEMPTS} times, perhaps because memory ran out"
+    return Outcome(name, CRASHED, f"{reason}: try fewer --workers")
+
+
+def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
+    """The same on the Ray cluster that RAY_ADDRESS names, or else on a local one.
+
+    All nodes need the study's folder at the same path. The runs of a node that dies are resumed on
+    another. Closed early, this cancels the runs under way; their checkpoints are up to a minute
+    old.
+    """
+    import ray
+
+    task = on_cluster(work, workers, gpus=int(plan.device == CUDA))
+    known = imported_modules()
+    under_way = {task.remote(plan.assigned(cell), known): cell for cell in cells}
+    try:
+        while under_way:
+            (done,), _ = ray.wait(list(under_way))
+            cell = under_way.pop(done)
+            try:
+                yield ray.get(done)
+            except ray.exceptions.WorkerCrashedError:
+                yield _killed(cell.name)
+            except ray.exceptions.RayError as error:
+                reason = str(error).strip().rpartition("\n")[2]
+                yield Outcome(cell.name, CRASHED, reason)
+    finally:
+        for job in under_way:
+            ray.cancel(job, force=True)
+
+
+BACKENDS: dict[str, Backend] = {"local": on_this_machine, "ray": on_ray}
+
+
+def run_study(
+    plan: Plan,
+    backend: Backend = on_this_machine,
+    workers: int | None = None,
+) -> int:
+    """Collect data, train encoders, and train every agent that hasn't been trained yet.
+
+    A study with claims is registered first: beside its file, in a commit, where git has that file.
+    At last the policies play that agents are compared with.
+
+    Args:
+        plan: the study.
+        backend: what runs it.
+        workers: how many processes go on at a time; by default as many as are usual.
+
+    Returns:
+        How many runs crashed.
+    """
+    check(plan)
+    workers, unfinished = workers or usual_workers(plan), plan.unfinished
+    registered = find_committed(plan.file, plan.study) if plan.file else None
+    make_folder(plan.folder, _OWN)
+    with exclusive(plan.folder):
+        plan.begin()
+        if registered:
+            plan.register(registered)
+        elif plan.study.has_claims and not plan.has_begun:
+            plan.register(plan.to_register(policies(plan)))
+        prepare(plan, workers)
+        for cell in plan.cells:  # so that any mistake shows before the first run
+            if standing_of(plan.run(cell), plan.folder_of(cell)).ended:
+                drop_checkpoint(plan.folder_of(cell))  # it was killed at the very end
+        plan.write()  # not before: a study that is refused changes nothing
+        progress = Progress(plan, unfinished)
+        if unfinished:
+            with progress.live, closing(backend(plan, unfinished, workers)) as outcomes:
+                for outcome in outcomes:
+                    progress.report(outcome)
+        if runs_below(plan.folder):
+            write_tables(plan.folder)
+            play_references(plan.folder)
+    return progress.counts[CRASHED]
+
+
+def register_study(plan: Plan) -> Path:
+    """Write down what is going to be run: beside the study's file, or in its folder without one.
+
+    What is registered already stays as it is. Returns the registration's file.
+    """
+    check(plan)
+    if plan.file is None:
+        make_folder(plan.folder, _OWN)
+        with exclusive(plan.folder):
+            plan.begin()
+            plan.write()
+            if plan.registration is None:
+                plan.register(plan.to_register(policies(plan)))
+        return plan.folder / REGISTRATION
+    path = beside(plan.file)
+    if not exists(path) or registration_in(path).registered != plan.study:
+        plan.check_new()
+        plan.to_register(policies(plan)).write(path)
+    return path
+
+
+class Progress:
+    """A line for each run that ends; on a terminal also a live table of the runs under way.
+
+    Args:
+        plan: the study.
+        unfinished: the runs to go.
+
+    Attributes:
+        live: a context that shows the table.
+        counts: how many runs have ended, by status.
+    """
+
+    def __init__(self, plan: Plan, unfinished: Iterable[Cell]):
+        self._plan, self._unfinished = plan, {cell.name: cell for cell in unfinished}
+        ended = [cell for cell in plan.cells if cell.name not in self._unfinished]
+        self.counts = Counter[str](read_run(plan.folder_of(cell)).status for cell in ended)
+        self._start, self._steps_before = time.monotonic(), self._steps()
+        self.live: AbstractContextManager[object] = nullcontext()
+        if sys.stderr is not None and sys.stderr.isatty():
+            console = Console(stderr=True)
+            self.live = Live(
+                console=console, get_renderable=self._table, refresh_per_second=1, transient=True
+            )
+
+    def report(self, outcome: Outcome) -> None:
+        """Count a run that has ended, and print a line."""
+        del self._unfinished[outcome.name]
+        self.counts[outcome.status] += 1
+        total = len(self._plan.cells)
+        number = total - len(self._unfinished)
+        say(f"{number}/{total} {outcome.name} {outcome.status}: {outcome.message}")
+
+    def _table(self) -> Table:
+        table = Table("running", box=None, pad_edge=False)
+        for name in ("steps", "last evaluation"):
+            table.add_column(name, justify="right")
+        steps = self._plan.study.steps
+        for cell in list(self._unfinished.values()):
+            step, mean = self._plan.progress(cell)
+            last = mean if step < steps else "final ones under way"
+            if step:
+                table.add_row(cell.name, f"{step:,} of {steps:,}", last)
+        table.caption = self._summary()
+        return table
+
+    def _summary(self) -> str:
+        counts = [f"{self.counts[status]} {status}" for status in (FINISHED, FAILED, CRASHED)]
+        to_go = len(self._plan.cells) * self._plan.study.steps - (steps := self._steps())
+        left, done = "-", steps - self._steps_before
+        if done > 0:
+            left = duration((time.monotonic() - self._start) / done * to_go)
+        return ", ".join([*counts, f"{len(self._unfinished)} to go, {left} left"])
+
+    def _steps(self) -> int:
+        """Steps that all runs have done, those that have ended all of theirs."""
+        unfinished = list(self._unfinished.values())
+        ended = len(self._plan.cells) - len(unfinished)
+        under_way = sum(self._plan.progress(cell)[0] for cell in unfinished)
+        return ended * self._plan.study.steps + under_way
