@@ -22,7 +22,8 @@ _ALIKE = 0.01  # by which even clocks may differ and count as the same
 _MOST_GROWTH = 1000  # rows for each that was read, where they are more than so many:
 _MOST_SHORT = 1_000_000
 _MOST_NUMBERS = 50_000_000
-_MOST_PASSED = 0.2  # of readings that come no faster than rows
+_MOST_PASSED = 0.2  # of readings that come no faster than rows, or hardly:
+_AS_FAST = 1.1
 _EVEN = 0.1  # by which most steps of an even clock may differ from the median
 
 
@@ -130,7 +131,7 @@ def _signal(
     else:
         even = values[last].astype(float)
         passed = len(time) - len(np.unique(last))
-        if len(time) <= len(grid) and passed > _MOST_PASSED * len(time):
+        if len(time) <= _AS_FAST * len(grid) and passed > _MOST_PASSED * len(time):
             bursts = (
                 f"of {leaf.name} in bursts shorter than a step, but for the last of each: left out"
             )

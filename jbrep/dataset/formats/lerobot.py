@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from jbrep.dataset.formats.arrays import column_of
 from jbrep.dataset.formats.clock import same_clock, timestep_of
 from jbrep.dataset.formats.frame import PEEKED, About, Frame, check_plain, label_of, measured, width
-from jbrep.dataset.formats.parquet import batches_of, reading
+from jbrep.dataset.formats.parquet import batches_of, opened
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
@@ -68,12 +68,12 @@ def read(given: str) -> Frame:
     paths = sorted(folder.glob("data/*/*.parquet"))
     if not paths:
         raise InputError(f"{given} has no data/chunk-*/*.parquet: download it whole")
-    with reading(paths[0]), pq.ParquetFile(paths[0]) as file:
+    with opened(paths[0]) as file:
         schema = measured(file.schema_arrow, next(file.iter_batches(PEEKED), None))
     rows = 0
     for path in paths:
-        with reading(path):
-            rows += pq.read_metadata(path).num_rows
+        with opened(path) as file:
+            rows += file.metadata.num_rows
     if frames not in (None, rows):
         raise InputError(
             f"{given} has {rows:,} rows, and {INFO} says {frames:,}: download it whole"
@@ -100,7 +100,7 @@ def _clock_notes(path: Path, schema: pa.Schema, fps: float) -> tuple[str, ...]:
     """What to say where the first rows' own times contradict the rate."""
     if "timestamp" not in schema.names:
         return ()
-    with pq.ParquetFile(path) as file:
+    with opened(path) as file:
         batch = next(file.iter_batches(PEEKED, columns=["timestamp"]), None)
     times = np.array([] if batch is None else batch.column(0), np.float64)
     step = timestep_of(np.diff(times))

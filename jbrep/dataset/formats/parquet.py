@@ -4,7 +4,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ _SETTINGS = b"jbrep"  # of the data set, in the metadata of a table that was exp
 def read(given: str) -> Frame:
     """Read a table, and the one of its episodes if jbrep exported it."""
     path = Path(given)
-    with reading(path), pq.ParquetFile(path) as file:
+    with opened(path) as file:
         rows, metadata = file.metadata.num_rows, file.metadata.metadata or {}
         schema = measured(file.schema_arrow, next(file.iter_batches(PEEKED), None))
         own = _exported(path, schema, metadata[_SETTINGS]) if _SETTINGS in metadata else {}
@@ -48,16 +48,22 @@ def read(given: str) -> Frame:
     )
 
 
-def reading(path: Path) -> AbstractContextManager[None]:
-    """Say of a file that it can't be read."""
+@contextmanager
+def opened(path: Path) -> Iterator[pq.ParquetFile]:
+    """A file of any name, whose pages' checksums are compared."""
     errors = (OSError, KeyError, TypeError, ValueError, pa.ArrowException)
-    return refusing(f"{path} can't be read as a Parquet file", errors, told=first_line)
+    with (
+        refusing(f"{path} can't be read as a Parquet file", errors, told=first_line),
+        path.open("rb") as file,
+        pq.ParquetFile(file, page_checksum_verification=True) as table,
+    ):
+        yield table
 
 
 def batches_of(paths: list[Path], columns: list[str]) -> Iterator[pa.RecordBatch]:
-    """The rows of some columns, in one file after the other; pages' checksums are compared."""
+    """The rows of some columns, in one file after the other."""
     for path in paths:
-        with reading(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
+        with opened(path) as file:
             yield from file.iter_batches(CHUNK, columns=columns)
 
 
@@ -70,8 +76,8 @@ def _exported(path: Path, schema: pa.Schema, settings: bytes) -> dict[str, Any]:
     if not exists(beside):
         raise InputError(f"{beside} is missing: it belongs to {path}, and must stand beside it")
     check_plain(beside)
-    with reading(beside):
-        episodes = pq.read_table(beside)
+    with opened(beside) as file:
+        episodes = file.read()
         final = np.stack(episodes["final_observation"].to_numpy())
         once = {name: episodes[name].to_numpy() for name in (*ENDS, "seed")}
     told = zip(task.features, task.offset.tolist(), strict=True)

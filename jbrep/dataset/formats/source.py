@@ -166,10 +166,12 @@ class Source:
 
     def _since(self, times: Array, origin: Any, first: int) -> Array:
         """Times since the first one [s]."""
-        if times.dtype.kind == "i" and np.abs(times.astype(float) - float(origin)).max() >= 2**63:
-            raise InputError(f"{self._at(first)}: times are further apart than 64 bits hold")
-        with np.errstate(over="ignore"):
-            return (times - origin).astype(float) * self._second
+        with np.errstate(over="ignore", invalid="ignore"):
+            since = (times - origin).astype(float)
+            apart = np.abs(times.astype(float) - float(origin))
+        if not (np.isfinite(apart).all() and (times.dtype.kind == "f" or apart.max() < 2**63)):
+            raise InputError(f"{self._at(first)}: times are too far apart: correct them")
+        return since * self._second
 
     def _check_late(self) -> None:
         asked = (*self._layout.observations, *self._layout.actions)
