@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import NamedTuple
@@ -58,8 +59,9 @@ def examine() -> Iterator[Finding]:
     yield Finding("cores", f"{cores()}: collect steps robots on all, a study has a run on each")
     if hasattr(os, "sysconf"):  # not on Windows
         yield Finding("memory", f"{memory() / 2**30:.0f} GiB")
-    free = shutil.disk_usage(Path.cwd()).free
-    yield Finding("disk", f"{free / 2**30:.0f} GiB free here; 5 million states take 0.4 to 1.9")
+    with suppress(OSError):  # where this folder was deleted
+        free = shutil.disk_usage(Path.cwd()).free
+        yield Finding("disk", f"{free / 2**30:.0f} GiB free here; 5 million states take 0.4 to 1.9")
     yield Finding("GPU", _gpu())
     yield Finding("OpenGL", _opengl())
     address = os.environ.get("RAY_ADDRESS")

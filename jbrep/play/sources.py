@@ -1,5 +1,6 @@
 """What a user names: an episode of a data set, or a policy of a run, in a file, or by its name."""
 
+import hashlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -229,15 +230,22 @@ class Described(msgspec.Struct):
 def read_exported(path: Path) -> tuple[Any, Described]:
     """The session of onnxruntime that computes a policy's actions, and what the file says of it."""
     from jbrep.encoders.imported import session  # imports onnx
+    from jbrep.rl.controller import NOT_SEALED, SEAL
 
     what = f"{path} isn't an ONNX model that can be run"
+    content = read_file(path)
     with refusing(what, told=first_line, kind=DamageError):
-        made = session(read_file(path))
-    text = made.get_modelmeta().custom_metadata_map.get("jbrep", "")
+        made = session(content)
+        known = made.get_modelmeta().custom_metadata_map
     try:
-        return made, msgspec.json.decode(text, type=Described)
+        told = msgspec.json.decode(known.get("jbrep", ""), type=Described)
     except msgspec.DecodeError:  # also of a field that doesn't fit
         raise InputError(f"{path} isn't a policy that jbrep policy export wrote") from None
+    seal = known.get(SEAL, "")
+    plain = content.replace(seal.encode(), NOT_SEALED.encode()) if seal else content
+    if hashlib.sha256(plain).hexdigest() != seal:
+        raise DamageError(f"{path} is damaged: it isn't what was exported, by its SHA-256")
+    return made, told
 
 
 def exported_player(path: Path, task: Task | None = None) -> Player:

@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -70,6 +71,8 @@ def make_report(
     Evaluations are those of `add_diagnostics`.
     """
     out, ran = out or folder, has_runs(folder)
+    if ran and out != folder and not os.access(folder, os.W_OK):  # it has its tables already
+        ran = False
     if not ran:
         check_tables(folder)
     make_folder(out, () if out.resolve() == folder.resolve() else (FINDINGS,))

@@ -3,6 +3,7 @@
 Any runtime of ONNX, or torch alone, computes actions with such a file.
 """
 
+import hashlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,6 +27,7 @@ from jbrep.rl.normalization import CLIP, Statistics
 from jbrep.rl.policy_file import PolicyFile, read
 from jbrep.rl.run_settings import RunSettings
 
+SEAL, NOT_SEALED = "sha256", "0" * 64  # of an ONNX file, in whose place zeros stand then
 _HIDDEN = "latent_pi.", "mlp_extractor.policy_net.", "mu."  # sequences, numbered from 0
 _LAST = "mu", "action_net"  # single layers after them
 _ON_POLICY = "ppo", "a2c", "trpo"  # whose actions are clipped; those of others are squashed
@@ -138,12 +140,12 @@ class Controller:
         changes nothing: the next call goes on from the one before.
         """
         try:
-            rows = np.asarray(observation, np.float32)
-        except (TypeError, ValueError):
+            rows = _numbers(observation)
+        except (TypeError, ValueError, OverflowError, RuntimeError):
             shown = len(self.task.view.places) if self.task.view else self.task.size
             raise InputError(
                 f"the observation is a {type(observation).__name__}: the policy takes {shown} "
-                "numbers in one array, as gymnasium.spaces.flatten(env.observation_space, "
+                "numbers, none of them masked, in one array, as gymnasium.spaces.flatten(env.observation_space, "
                 "observation) gives them"
             ) from None
         seen = self._seen(rows)
@@ -342,6 +344,14 @@ def described(controller: Controller) -> dict[str, Any]:
     }
 
 
+def _numbers(observation: ArrayLike) -> NDArray[np.float32]:
+    """An observation's numbers; a masked one is a reading that is missing."""
+    given = np.ma.asanyarray(observation)
+    if given.dtype.kind not in "fiub" or np.ma.is_masked(given) or not given.size:
+        raise TypeError
+    return np.asarray(given, np.float32)
+
+
 def _onnx(controller: Controller) -> bytes:
     from jbrep.encoders.onnx import traced  # imports onnx
 
@@ -352,7 +362,9 @@ def _onnx(controller: Controller) -> bytes:
         yield "action", acting.actions(encoder.arrays.encode(observation))
 
     model = traced("controller", controller.task.size, outputs, described(controller))
-    return bytes(model.SerializeToString(deterministic=True))
+    model.metadata_props.add(key=SEAL, value=NOT_SEALED)
+    content: bytes = model.SerializeToString(deterministic=True)
+    return content.replace(NOT_SEALED.encode(), hashlib.sha256(content).hexdigest().encode())
 
 
 def _torch(controller: Controller) -> bytes:

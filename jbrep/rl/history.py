@@ -105,7 +105,7 @@ class Bar:
         """The last mean return, after a curve of all where there are Unicode's blocks."""
         if not means:
             return "-"
-        curve = "" if self._progress.ascii else sparkline(means, _CURVE)
+        curve = "" if getattr(self._progress, "ascii", True) else sparkline(means, _CURVE)
         return f"{curve} {rounded(means[-1])[0]}".strip()
 
     def close(self) -> None:
