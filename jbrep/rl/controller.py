@@ -145,8 +145,8 @@ class Controller:
             shown = len(self.task.view.places) if self.task.view else self.task.size
             raise InputError(
                 f"the observation is a {type(observation).__name__}: the policy takes {shown} "
-                "numbers, none of them masked, in one array, as gymnasium.spaces.flatten(env.observation_space, "
-                "observation) gives them"
+                "numbers, none of them masked, in one array, as "
+                "gymnasium.spaces.flatten(env.observation_space, observation) gives them"
             ) from None
         seen = self._seen(rows)
         self._held = self._act(seen.observation)
@@ -346,7 +346,7 @@ def described(controller: Controller) -> dict[str, Any]:
 
 def _numbers(observation: ArrayLike) -> NDArray[np.float32]:
     """An observation's numbers; a masked one is a reading that is missing."""
-    given = np.ma.asanyarray(observation)
+    given: NDArray[Any] = np.ma.asanyarray(observation)
     if given.dtype.kind not in "fiub" or np.ma.is_masked(given) or not given.size:
         raise TypeError
     return np.asarray(given, np.float32)

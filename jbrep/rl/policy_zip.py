@@ -45,6 +45,7 @@ _OF_TRAINING = {
 }
 _OF_THIS_PROCESS = {  # wall times, and where the environment was: `load` starts with defaults
     "_last_episode_starts",
+    "_current_progress_remaining",
     "_last_obs",
     "_last_original_obs",
     "_num_timesteps_at_start",
