@@ -11,6 +11,7 @@ _Choice = TypeVar("_Choice")
 _MOST_NAMES = 20
 _MOST_SHOWN = 3  # settings that differ
 _MOST_LETTERS = 40  # of a value
+STEP_TIMEOUT = "JBREP_STEP_TIMEOUT"  # a variable: seconds that an environment may take
 _MOST = 500  # letters of a stranger's message
 
 

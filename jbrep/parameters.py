@@ -4,6 +4,7 @@ The other parameters of a function are described in its docstring. `jbrep.cli.ge
 options of commands from both.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
-from jbrep.errors import InputError
+from jbrep.errors import STEP_TIMEOUT, InputError
 from jbrep.rl.settings import CLASSES
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ def described(
     missing: Annotated[str | None, Meta(extra={"metavar": "[skip|hold:N]"})] = None,
     hide: Hide = (),
     history: History = 1,
+    step_timeout: Annotated[float, Meta(gt=0, le=1e6)] | None = None,
 ) -> "Task | None":
     """The task of that name, with what is said of its environment; None if nothing is.
 
@@ -126,7 +128,11 @@ def described(
         features: a TOML file with names, units, ranges, kinds and offsets of the features.
         missing: what becomes of readings that aren't finite: an episode ends before one, or the
             last one is held for at most N steps; otherwise they are errors.
+        step_timeout: seconds after which a reset or step that hasn't come back has failed, as of a
+            robot that stalls.
     """
+    if step_timeout:
+        os.environ[STEP_TIMEOUT] = str(step_timeout)  # for processes that are started, too
     if task is None:
         if env or episode_steps or features or missing or hide or history > 1:
             raise InputError("give the --task: one of the Jitterbug's, or a Gymnasium id")

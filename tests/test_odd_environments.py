@@ -27,6 +27,7 @@ COMMANDS = {
     "inspect": ("inspect", "uniform", *TASK, "--out", "out.rrd"),
 }
 SECONDS = 60
+STALL = "a stall"
 WHEN = ("make", "reset", "step")
 
 
@@ -62,6 +63,7 @@ def in_a_fork(arguments, folder):
 def played(command, how, when, folder):
     """What a command does in an environment that does that: exit code, output, errors."""
     said = ("--env", f"how={how}", "--env", f"when={when}") if how else ()
+    said += ("--step-timeout", "0.5") if how == STALL else ()
     return in_a_fork((*COMMANDS[command], *said), folder)
 
 
@@ -101,7 +103,7 @@ def problem(command, how, when, folder):
 
 
 CASES = [  # each thing with one command and one moment; tools/odd.py tries all
-    (how, command, when)
+    (how, command, when if how != STALL else "step")  # making it may take its time
     for how, (command, when) in zip(
         (*HARMLESS, *FAILS),
         itertools.cycle(zip(itertools.cycle(COMMANDS), itertools.cycle(WHEN * 2 + WHEN[:1]))),

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jbrep.errors import StoppedProcess, kind_and_line
+from jbrep.errors import STEP_TIMEOUT, StoppedProcess, kind_and_line
 
 
 class _Global(NamedTuple):
@@ -121,6 +121,26 @@ class _ToErrors(TextIOBase):
 
     def close(self) -> None:
         """Leave it open."""
+
+
+@contextmanager
+def in_time() -> Iterator[None]:
+    """Let what takes longer than `STEP_TIMEOUT` says fail, if that is said."""
+    seconds = float(os.environ.get(STEP_TIMEOUT, 0))
+    if not seconds or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def fail(*_signal: Any) -> None:
+        raise TimeoutError(f"it hasn't come back within {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, fail)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 OURS = (KeyboardInterrupt, StoppedProcess)  # which no environment raises

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.envs.aside import OURS, aside
+from jbrep.envs.aside import OURS, aside, in_time
 from jbrep.envs.disturbed import Disturbed
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
 from jbrep.envs.make import (
@@ -318,7 +318,7 @@ class Separate:
             self.failed[lane] = False
             try:
                 self.envs[lane] = self.envs[lane] or self._take()
-                with aside():
+                with aside(), in_time():
                     observation, info = self.envs[lane].reset(seed=seed)
                 return self._put(lane, observation, info)
             except OURS:
@@ -332,7 +332,7 @@ class Separate:
         self._reward, self.lost = np.zeros(len(chosen)), np.zeros(len(chosen), np.bool_)
         single = actions.astype(np.float32)
         terminated, truncated = np.zeros((2, len(chosen)), np.bool_)
-        with aside(in_episode=True):
+        with aside(in_episode=True), in_time():
             for lane in np.flatnonzero(chosen).tolist():
                 self._steps[lane] += 1
                 try:

@@ -97,6 +97,7 @@ FAILS = {  # it is a failure like any other
     "no file": lambda: open("/no/such/file"),  # noqa: SIM115, PTH123
     "broken pipe": lambda: _raise(BrokenPipeError("peer has gone")),
     "recursion without end": lambda: _forever(),
+    "a stall": lambda: time.sleep(60),
 }
 
 
