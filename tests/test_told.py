@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from jbrep.dataset.formats import open_sources
 from jbrep.dataset.formats.writer import write
+from jbrep.envs.task import MAX_FEATURES
 from jbrep.errors import InputError
 
 TIMES = np.arange(60) / 20
@@ -129,3 +130,11 @@ def test_names_of_files_that_are_not_utf_8(kind, tmp_path):
 def test_a_flag_that_is_no_number_is_refused(tmp_path):
     ends = np.where(np.arange(25) == 3, np.nan, np.arange(25) == 9)
     assert "row 3" in not_imported(write_d4rl(tmp_path / "a.hdf5", terminals=ends))
+
+
+def test_more_features_than_a_shard_names_are_refused_at_once(tmp_path):
+    rows = {"actions": np.zeros((9, 1), "f4"), "terminations": np.arange(9) == 8}
+    np.savez(tmp_path / "a.npz", observations=np.zeros((9, MAX_FEATURES + 1), "f4"), **rows)
+    assert "observation" in not_imported(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", observations=np.zeros((9, MAX_FEATURES), "f4"), **rows)
+    assert imported(tmp_path / "b.npz")[1].task.size == MAX_FEATURES

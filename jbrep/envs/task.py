@@ -23,7 +23,7 @@ MAX_EPISODE_STEPS = 1_000_000
 SeedBits = Literal[63, 31]
 WIDE_SEEDS: SeedBits = 63  # bits of the seeds that most environments take
 NARROW_SEEDS: SeedBits = 31  # and of those of others
-MAX_FEATURES = 4096
+MAX_FEATURES = 4000  # an attribute of HDF5 holds their names
 _MAX_ACTIONS = 1024
 _LETTERS = "letters of ASCII, digits, '_', '-' and '.'"
 EpisodeSteps = Annotated[int, Meta(ge=1, le=MAX_EPISODE_STEPS)]
