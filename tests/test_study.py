@@ -5,12 +5,11 @@ import json
 import os
 import shutil
 import signal
-import sys
 import threading
 import time
 import tomllib
 from collections import Counter
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from pathlib import Path
 
 import gymnasium
@@ -26,7 +25,6 @@ from command import (
 )
 from small import adopt, forge
 
-from jbrep.dataset import Dataset
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.errors import InputError
@@ -37,14 +35,13 @@ from jbrep.reporting.tables import read_tables
 from jbrep.rl.files import CHECKPOINT, RUN, read_run
 from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.stats.rules import Rules
-from jbrep.studies import prepare as prepare_module
 from jbrep.studies.config import Data, Study, as_study, read_study
 from jbrep.studies.forecast import forecast
 from jbrep.studies.plan import PROGRESS, STUDY, Plan, read_plan
 from jbrep.studies.prepare import check, prepare
 from jbrep.studies.record import RunsRecord
 from jbrep.studies.representations import ByName
-from jbrep.studies.runner import Outcome, Progress, on_this_machine, run_study, work
+from jbrep.studies.runner import on_this_machine, run_study, work
 from jbrep.studies.tables import (
     REFERENCE_RETURNS,
     RETURNS,
@@ -297,16 +294,7 @@ def test_other_runs_in_its_folder_draw_nothing(done):
     assert record.draws_of("sac+learning_starts=120") == {}
 
 
-def test_it_makes_data_and_encoders(tmp_path, monkeypatch):
-    """Only the Jitterbug's tasks are derived from each other."""
-    derived = []
-
-    def derive(source, task, folder, **given):
-        derived.append(task)
-        return derive_really(source, task, folder, **given)
-
-    derive_really = prepare_module.derive
-    monkeypatch.setattr(prepare_module, "derive", derive)
+def test_it_makes_data_and_encoders(tmp_path):
     study = TINY.replace(
         tasks=("Pendulum-v1", "face_direction", "move_to_pose"),
         representations=("full", "dae-2", "random-1"),
@@ -324,7 +312,6 @@ def test_it_makes_data_and_encoders(tmp_path, monkeypatch):
         prints.add((cell.task, encoder.header.data["fingerprint"]))
         plan.run(cell).check()
     assert len(prints) == 3
-    assert derived == ["move_to_pose"]
     stamp = {p: p.stat().st_mtime_ns for p in plan.folder.rglob("*.safetensors")}
     assert len(stamp) == 9
     prepare(plan)
@@ -431,42 +418,6 @@ def test_a_stopped_study_leaves_checkpoints_and_no_workers(tmp_path):
     assert told.stderr == f"Error: no finished run below {out}: jbrep study resumes it\n"
 
 
-def test_a_terminal_shows_the_runs_under_way_and_the_time_left(tmp_path, monkeypatch):
-    clock = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
-    plan = Plan(TINY, tmp_path)
-    progress = Progress(plan, plan.cells)
-    assert progress._summary().endswith("4 to go, - left")
-    folder = plan.folder_of(plan.cells[0])
-    folder.mkdir(parents=True)
-    (folder / PROGRESS).write_text("40 12")
-    clock[0] = 20.0
-    shown = progress._table()
-    assert shown.row_count == 1
-    assert [*shown.columns[1].cells, *shown.columns[2].cells] == ["40 of 80", "12"]
-    assert shown.caption == "0 finished, 0 failed, 0 crashed, 4 to go, 2.3 min left"  # 280 of 40
-
-
-def test_progress_is_a_line_for_each_run_where_there_is_no_terminal(done, capsys, monkeypatch):
-    outcomes = [Outcome(cell.name, "finished", "1.0 min") for cell in done.cells[:3]]
-    progress = Progress(done, done.cells)
-    progress.report(outcomes[0])
-    progress.report(outcomes[1])
-    monkeypatch.setattr(sys, "stderr", None)  # closed
-    progress.report(outcomes[2])
-    with Path("/dev/full").open("w") as full:
-        monkeypatch.setattr(sys, "stderr", full)
-        progress.report(Outcome(done.cells[3].name, "failed", "loss is nan"))
-        monkeypatch.undo()
-        with suppress(OSError):
-            full.close()
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.splitlines() == [
-        f"{i}/4 {outcome.name} finished: 1.0 min" for i, outcome in enumerate(outcomes[:2], 1)
-    ]
-
-
 def test_tables_fit_the_terminal(done):
     write_tables(done.folder)
     assert max(map(len, results_text(Findings.of(read_tables(done.folder)), 80).splitlines())) <= 80
@@ -563,22 +514,6 @@ def test_a_run_is_played_before_and_after_training_with_another_body(done):
     run = done.folder / "runs" / "face_direction" / "a2c" / "full" / "seed-0"
     other = describe("face_direction", {"body": 7}, 100)
     assert find_player(str(run), other).task == other
-
-
-def test_tasks_may_come_and_go_whichever_was_collected(tmp_path):
-    def prepared(*tasks):
-        study = TINY.replace(
-            tasks=tasks, representations=("full", "random-1"), data={"": Data(steps=1000)}
-        )
-        plan = Plan(study, tmp_path / "made")
-        plan.write()
-        prepare(plan)
-        return {task: Dataset(plan.data(task)).manifest.settings for task in tasks}
-
-    assert prepared("face_direction")["face_direction"].store_state
-    made = prepared("move_to_pose", "face_direction")
-    assert [made[task].store_state for task in ("move_to_pose", "face_direction")] == [False, True]
-    assert not prepared("move_to_pose")["move_to_pose"].store_state
 
 
 def test_a_study_for_a_gpu_is_read_where_there_is_none(tmp_path, monkeypatch):
