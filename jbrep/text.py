@@ -7,7 +7,6 @@ import sys
 import textwrap
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from html import escape
 from itertools import chain, count, pairwise
 from typing import NamedTuple, TypeVar
 
@@ -52,31 +51,6 @@ class Table(NamedTuple):
         """The title and the table for a terminal of that width, in columns; None for any."""
         cells = table(self.header, self.rows, width)
         return f"{wrapped(self.title, width)}\n\n{cells}" if self.title else cells
-
-    def html(self) -> str:
-        """The title and the table for a notebook."""
-        aligned = ["right" if numeric else "left" for numeric in self.numeric]
-        lines = [("th", self.header), *(("td", row) for row in self.rows)]
-        rows = "".join(
-            "<tr>"
-            + "".join(
-                f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>'
-                for side, cell in zip(aligned, cells, strict=True)
-            )
-            + "</tr>"
-            for tag, cells in lines
-        )
-        return f"<table><caption>{escape(self.title)}</caption>{rows}</table>"
-
-
-def html(*parts: "str | Table") -> str:
-    """Texts and tables for a notebook, one below the other; lines of a text stay as they are."""
-    return "".join(
-        each.html()
-        if isinstance(each, Table)
-        else f"<p style='white-space:pre-wrap'>{escape(each)}</p>"
-        for each in parts
-    )
 
 
 def wrapped(text: str, width: int | None) -> str:

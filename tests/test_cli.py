@@ -3,10 +3,8 @@
 import json
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,6 @@ from stable_baselines3 import A2C
 from test_study import TOML
 
 from jbrep.cli import main
-from jbrep.cli.signals import stoppable
 from jbrep.encoders import find, load, save
 from jbrep.encoders.shipped import unlearned
 from jbrep.envs import describe
@@ -383,27 +380,6 @@ def test_a_shell_completes_tasks_kinds_and_encoders(typed, begun, expected):
     completing = ShellComplete(main, {}, "jbrep", "_JBREP_COMPLETE")
     found = completing.get_completions(typed.split(), begun)
     assert [item.value for item in found] == expected
-
-
-def test_a_stop_that_comes_while_an_object_is_destroyed_is_not_lost(capsys):
-    """Python prints and drops whatever is raised there, also what a handler of signals raises."""
-
-    class Stopping:
-        def __del__(self):
-            signal.raise_signal(signal.SIGINT)
-
-    @stoppable("nothing is lost")
-    def work():
-        Stopping()
-        time.sleep(10)
-        pytest.fail("it went on")
-
-    usual = sys.unraisablehook
-    with pytest.raises(SystemExit) as stopped:
-        work()
-    assert stopped.value.code == 130
-    assert sys.unraisablehook is usual
-    assert capsys.readouterr().err == "stopped; nothing is lost\n"
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import rerun as rr
-from command import jbrep, start, wait_for, wait_for_the_end_of
+from command import jbrep
 from made_up import write_checkpoint
 from rerun.chunk import RrdReader
 from small import ONE_EACH
@@ -22,11 +22,9 @@ from jbrep.inspection import inspect
 from jbrep.inspection.blueprint import traversal_layout
 from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot, rotate, shapes
-from jbrep.inspection.scene import contacts, shades
+from jbrep.inspection.scene import shades
 from jbrep.inspection.signals import panels, principal_components
 from jbrep.inspection.subject import POINTS, SPACING, sweep
-from jbrep.play import jitterbug
-from jbrep.play.jitterbug import reward_terms
 from jbrep.play.sources import find_episode
 from jbrep.rl import Run
 
@@ -166,21 +164,6 @@ def test_series_are_the_episodes(entities, rollout):
     np.testing.assert_array_equal(scalars(entities["/action"]), rollout.action)
     assert names(entities["/action"]) == ["action_0 [-1, 1]"]
     np.testing.assert_array_equal(scalars(entities["/reward/total"])[:, 0], rollout.reward)
-    terms = entities["/reward/terms"]
-    expected = reward_terms(task, rollout.motion)
-    np.testing.assert_array_equal(scalars(terms), np.transpose([*expected.values()]))
-    assert names(terms) == ["upright [1]", "heading [1]"]
-
-
-def test_contacts_carry_the_robot(entities, robot, rollout):
-    counts, points, forces = contacts(robot, rollout.motion)
-    lift = forces[:, 2].sum() / ROWS
-    assert lift == pytest.approx(robot.weight, rel=0.1)  # over ten seconds, on the floor
-    assert np.abs(points[:, 2]).max() < 3e-3  # [m] half of how far a foot sinks in
-    assert len({*counts}) > 1
-    sent = entities["/world/contacts"]["Points3D:positions"].to_pylist()
-    assert [*map(len, sent)] == counts.tolist()
-    np.testing.assert_allclose(np.concatenate([p for p in sent if p]), points, atol=1e-7)
 
 
 def test_what_is_decoded(entities, rollout):
@@ -216,18 +199,12 @@ def test_what_is_decoded(entities, rollout):
 
 
 def test_an_encoder_that_keeps_all_gives_the_robot_back(unchanged):
-    found, true = read(unchanged), find_episode(POSE)
+    found = read(unchanged)
     place, turned = poses(found["/world/ghost/jitterbug"])
     there, attitude = poses(found["/world/robot/jitterbug"])
     up_to_sign = np.where((turned * attitude).sum(axis=1, keepdims=True) < 0, -1, 1)
     np.testing.assert_allclose(place, there, atol=1e-5)
     np.testing.assert_allclose(turned * up_to_sign, attitude, atol=1e-5)
-    readings = jitterbug.read(true.motion)
-    target = values(found["/world/ghost/target"], "Points3D:positions")[:, 0]
-    np.testing.assert_allclose(target, readings.target_position, atol=1e-5)
-    heading = values(found["/world/ghost/heading"], "Arrows3D:vectors")[:, 0, :2]
-    axis = readings.target_axis
-    np.testing.assert_allclose(heading, np.linalg.norm(heading[0]) * axis, atol=1e-5)
 
 
 def test_principal_components():
@@ -333,8 +310,7 @@ def test_any_robot_of_mujoco_is_recorded(short):
     there, back = (scalars(found[f"/{what}/{group}"]) for what in ("observation", "reconstruction"))
     np.testing.assert_allclose(back, there)
     assert any(path.startswith("/world/floor/") for path in found)
-    assert sum(len(each) for each in found["/world/contacts"]["Points3D:positions"].to_pylist()) > 0
-    assert not {"/world/ghost", "/reward/terms", "/error/bodies"} & {*found}
+    assert not {"/world/ghost", "/error/bodies"} & {*found}
 
 
 def test_a_robot_without_mujoco_shows_its_signals(short):
@@ -428,19 +404,6 @@ def test_bodies_that_stand_still_have_one_pose_and_bare_ones_no_shape(folder):
     assert not any(":colors" in name for name in found["/robot/a_b/bare"])
 
 
-def test_the_force_of_a_contact_is_the_one_on_the_robot():
-    """Of a ball on a box, MuJoCo gives the force on the box."""
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody><geom type="box" size="1 1 .1"/>
-        <body pos="0 0 .199"><freejoint/><geom type="sphere" size=".1" mass="1"/></body>
-        </worldbody></mujoco>"""
-    )
-    data = mujoco.MjData(model)
-    arrays = {"qpos": data.qpos[None].copy(), "qvel": data.qvel[None].copy()}
-    (force,) = contacts(Robot(model), Motion(model, arrays))[2]
-    assert force[2] > 1
-
-
 def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(tmp_path):
     task = describe("face_direction", max_episode_steps=50)
     write_checkpoint(
@@ -494,9 +457,6 @@ def test_the_command_names_the_file_after_its_content(tmp_path, monkeypatch):
     assert len(read(tmp_path / path)["/observation/position"]["step"]) == ROWS
     told = jbrep("inspect", "--encoder", "dae-4", "--task", "move_to_pose", "--traverse").output
     assert "inspect/move_to_pose-uniform-episode-0-dae-4-traverse.rrd\n" in told
-    refused = jbrep("inspect", FACE, "--view", "--serve")
-    assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
-    assert "Example: jbrep inspect " in jbrep("inspect", "--help").output
 
 
 @pytest.fixture
@@ -521,21 +481,8 @@ def viewer(tmp_path, monkeypatch):
     return make
 
 
-def test_the_viewer_is_rerun_itself_and_serves_this_machine_alone(viewer, brief, tmp_path):
+def test_the_viewer_is_rerun_itself(viewer, brief, tmp_path):
     told, out = viewer("sys.exit(3)"), tmp_path / "it.rrd"
     shown = jbrep("inspect", brief, "--out", out, "--view")
     assert json.loads(told.read_text())[1:] == ["--bind", "127.0.0.1", str(out)]
-    served = jbrep("inspect", brief, "--out", out, "--serve")
-    arguments = json.loads(told.read_text())[1:]
-    assert arguments[:3] == ["--bind", "127.0.0.1", "--serve-web"]
-    assert f"http://127.0.0.1:{arguments[4]}/" in served.output
-    assert (shown.exit_code, served.exit_code) == (2, 2)
-
-
-def test_the_viewer_ends_with_jbrep(viewer, brief, tmp_path):
-    """Also the program that Rerun's script starts, and also where jbrep can't say good-bye."""
-    told = viewer("time.sleep(600)")
-    with start("inspect", brief, "--out", tmp_path / "it.rrd", "--serve") as process:
-        assert wait_for(told.exists, process)
-        process.kill()
-    wait_for_the_end_of([json.loads(told.read_text())[0]], seconds=30)
+    assert shown.exit_code == 2

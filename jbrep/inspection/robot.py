@@ -76,7 +76,6 @@ class Robot:
         others: numbers of all other bodies, such as the world and a target.
         place: of the root in the model's reference pose, (3,) [m].
         size: from the root's origin to the farthest point of the robot, in the same pose [m].
-        weight: of the robot [N].
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -94,7 +93,6 @@ class Robot:
             f"{carrier}/{name}" if body in self.bodies and body != self.root else name
             for body, name in enumerate(self.names)
         ]
-        self.weight = float(model.body_subtreemass[self.root] * np.linalg.norm(model.opt.gravity))
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         self.place = data.xpos[self.root].copy()

@@ -24,8 +24,7 @@ from jbrep.inspection.recording import GREY, SUFFIX, Recording, check_out
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import WORLD, as_qpos, send_floor, send_ghost, send_scene
 from jbrep.inspection.signals import scaled_titles, send_encoding, send_signals, times_at
-from jbrep.jitterbug.tasks import POSITION
-from jbrep.play.jitterbug import jitterbug_task
+from jbrep.jitterbug.tasks import POSITION, jitterbug_task
 from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode, is_trained, run_folder
 from jbrep.records.storage import exists

@@ -15,7 +15,7 @@ from jbrep.encoders import FULL
 from jbrep.envs.recording import Actor, held
 from jbrep.envs.task import Array, Task, check_same
 from jbrep.errors import DamageError, InputError, first_line, refusing
-from jbrep.play.jitterbug import jitterbug_task
+from jbrep.jitterbug.tasks import jitterbug_task
 from jbrep.play.player import Player
 from jbrep.play.rollout import Rollout, replay
 from jbrep.records.storage import exists, read_file
