@@ -14,6 +14,7 @@ from PIL import Image
 
 from jbrep.envs import describe
 from jbrep.envs.make import make_env
+from jbrep.envs.names import import_modules
 from jbrep.envs.physics import physics_of
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import plain_model
@@ -21,6 +22,7 @@ from jbrep.play.film import Film, Pace, encode_gif, encode_mp4
 from jbrep.play.pictures import Camera, add_caption, band_height, find_camera
 from jbrep.play.sources import find_episode
 
+import_modules(["environments"])
 SIZE = (96, 64)
 SAMPLE = "data/sample/move_to_pose"
 
