@@ -7,12 +7,11 @@ import sys
 import textwrap
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from itertools import chain, count, pairwise
+from itertools import chain, count
 from typing import NamedTuple, TypeVar
 
 SIGNIFICANT = ",.3g"  # a format for `number`: three digits
 _GAP = "  "  # between columns
-_BLOCKS = "▁▂▃▄▅▆▇█"
 _NUMBER = re.compile(r"[<>]? ?-?[\d,]*\.?\d+(e[-+]?\d+)?( \[.*\]| \(\d+/\d+\))?")
 _COLUMN = re.compile(r"(step|action|reward)(_\d+)?")
 _NO_NUMBER = re.compile(r"-( \(\d+/\d+\))?")
@@ -63,21 +62,6 @@ def wrapped(text: str, width: int | None) -> str:
 def terminal_width() -> int:
     """COLUMNS if it is set, else the width of the terminal in characters; without one 80."""
     return shutil.get_terminal_size().columns
-
-
-def sparkline(values: Sequence[float], width: int) -> str:
-    """A curve of numbers in one line: a block for each, from the least to the largest.
-
-    Of more numbers than fit the width, each block shows the mean of its share. Those that aren't
-    finite are left out.
-    """
-    values = [value for value in values if math.isfinite(value)]
-    length = min(len(values), width)
-    ends = [len(values) * i // length for i in range(length + 1)] if length else []
-    means = [sum(values[a:b]) / (b - a) for a, b in pairwise(ends)]
-    least, most = min(means, default=0.0), max(means, default=0.0)
-    steps = (len(_BLOCKS) - 1) / (most - least) if most > least else 0.0
-    return "".join(_BLOCKS[round((each - least) * steps)] for each in means)
 
 
 def rounded(*values: float) -> list[str]:

@@ -221,7 +221,6 @@ def test_the_encoders_that_ship_are_listed(monkeypatch, tmp_path):
     text = jbrep("encoder", "list").output
     assert max(map(len, text.splitlines())) <= 80
     assert all(task in text for task in TASKS)
-    assert re.search(r"^ +forward +R² of the features' change", text, re.M)  # the column
     monkeypatch.setattr("jbrep.encoders.shipped._FOLDER", tmp_path)
     folder = tmp_path / "face_direction"
     folder.mkdir()
@@ -242,9 +241,6 @@ def test_the_encoders_that_ship_are_listed(monkeypatch, tmp_path):
         ["pca-8", "8", "0.51", "0.25", "-"],
         ["pca-4", "4", "-", "-", "-"],
     ]
-    listed = json.loads(jbrep("encoder", "list", "--task", "face_direction", "--json").output)
-    assert [each["latent_size"] for each in listed["face_direction"]] == [16, 8, 4]
-    assert listed["face_direction"][1]["diagnostics"] == given
     refused = jbrep("encoder", "list", "--task", "Hopper-v5")
     assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
     assert "no encoder ships for Hopper-v5: only for move_from_origin" in refused.output

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from judged import NOTHING, diagnostics, evaluation
+from judged import NOTHING
 from made_up import drawn, found_of
 from PIL import Image
 
-from jbrep.evaluation.evaluation import FeatureError, Prediction, Reconstruction, Score
-from jbrep.reporting.figures import encoder_plots, study_plots, write
+from jbrep.evaluation.evaluation import Score
+from jbrep.reporting.figures import study_plots, write
 from jbrep.reporting.figures.panels import COLUMN, PAGE, PAPER, fitting
 from jbrep.reporting.findings import Verdict
 from jbrep.stats import RunCurve, analyse
@@ -248,23 +248,6 @@ def test_names_and_policies_with_dollar_signs_are_no_formulas():
         drawn(plot).canvas.draw()
 
 
-def test_of_a_wide_robot_the_worst_features_are_shown():
-    """Humanoid's 348 would make a figure of 14,000 pixels, with names that nobody can read."""
-    r2 = [*(Score(1 - i / 348, None, None) for i in range(347)), NOTHING]  # the last is constant
-    features = [
-        FeatureError(name=f"obs_{i}", unit="", mse=NOTHING, rmse_physical=NOTHING, r2=each)
-        for i, each in enumerate(r2)
-    ]
-    lost = Reconstruction(mse=NOTHING, pca_mse=NOTHING, ratio_to_pca=None, features=features)
-    encoders = {"mine": diagnostics(348, kind="dae", reconstruction=lost)}
-    (by_feature,) = encoder_plots(evaluation(encoders, "Humanoid-v5"))
-    assert len(by_feature.rows) == 348
-    figure = drawn(by_feature)
-    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert names == [f"obs_{i}" for i in range(307, 347)]
-    assert figure.get_figheight() < 8
-
-
 def test_diagnostics_stand_against_final_returns(found):
     """Of every code that has them, whichever are registered; better ones to the right."""
     of_all = {"task": "face_direction", "algorithm": "ddpg", "correlation": NOTHING}
@@ -282,27 +265,3 @@ def test_diagnostics_stand_against_final_returns(found):
     mine, error = drawn(plot).axes
     assert mine.lines[1].get_xydata().tolist() == [[0.5, 500.0]]
     assert error.get_xlim()[0] > error.get_xlim()[1]
-
-
-def scores(quality):
-    """How well an encoder predicts, by the steps ahead."""
-    three = Score(quality, quality - 0.02, quality + 0.02)
-    known = {"features": {"yaw": three, "still": NOTHING}, "mean": three}
-    reward = Score(quality / 2, None, None)
-    return {steps: Prediction(**known, reward=reward, rewarded=None) for steps in ("1", "5", "20")}
-
-
-def test_predictions_stand_by_feature_and_encoder():
-    encoders = {
-        name: diagnostics(2, kind=name, prediction=scores(quality))
-        for name, quality in (("full", 0.9), ("slow-2", 0.8), ("slow-1", 0.1))
-    }
-    plot, by_horizon = encoder_plots(evaluation(encoders))
-    assert "5 steps" in plot.caption  # there are none of 10
-    assert values(by_horizon, "r2", encoder="slow-2", steps=20) == [0.8, 0.4]
-    axes = drawn(plot).axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == [
-        *("yaw", "still", "mean of features", "reward")
-    ]
-    expected = [[0.9, 0.8, 0.1], [np.nan] * 3, [0.9, 0.8, 0.1], [0.45, 0.4, 0.05]]
-    np.testing.assert_array_equal(axes.images[0].get_array(), expected)

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 from jbrep.progress import Progress
-from jbrep.text import duration, facts, slug, sparkline, table, words
+from jbrep.text import duration, facts, slug, table, words
 
 HEADER = ("encoder", "error", "ratio", "worst feature")
 ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "motor_angle")]
@@ -29,12 +29,6 @@ def test_any_names_become_different_words():
         *("t", "theta", "omega", "e", "q_0", "q_1", "x", "obs_0", "a_b", "a_b_2"),
         *("obs", "obs_step", "obs_action_1"),
     ]
-
-
-def test_a_curve_goes_from_the_least_to_the_largest():
-    assert sparkline([3, 10, 6.5, float("inf")], 5) == "▁█▅"
-    assert sparkline([0, 2, 8, 8, 7], 2) == "▁█"  # means of 1 and 7.67
-    assert (sparkline([5, 5], 5), sparkline([], 5)) == ("▁▁", "")
 
 
 def test_a_table_that_is_too_wide_is_cut_into_parts_that_fit_with_every_cell_once():
