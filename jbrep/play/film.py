@@ -140,8 +140,12 @@ def _start(rollout: Rollout) -> tuple[Any, ...]:
             f"{rollout.task.name} has no MuJoCo model and data: it can't be filmed, but jbrep "
             "inspect shows its signals"
         )
-    arrays = rollout.motion.arrays
-    return rollout.task, *(arrays[n][0].tolist() for n in ("qpos", "mocap_pos", "mocap_quat"))
+    task, arrays = rollout.task, rollout.motion.arrays
+    return (
+        task,
+        task.known_timestep,
+        *(arrays[n][0].tolist() for n in ("qpos", "mocap_pos", "mocap_quat")),
+    )
 
 
 class Format(NamedTuple):
