@@ -211,7 +211,6 @@ def test_a_mistake_is_one_line_and_exit_code_2(tmp_path, monkeypatch):
         *(("frames", "--fps", 0), ("speed", "--speed", "nan"), ("seconds", "--seconds", 0)),
         *(("start", "--episode", 1, "uniform"), ("episode 4", "--episode", 4)),
         *(("nowhere", "nowhere"), ("wide", "--size", "3840x64", "uniform", "uniform")),
-        ("fit", "--out", "a.gif", "--size", "1920x1080", "--seconds", 10),
     ):
         result = render(SAMPLE, "--task", "move_to_pose", "--out", "a.mp4", *arguments)
         assert result.exit_code == 2

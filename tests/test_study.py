@@ -45,7 +45,6 @@ from jbrep.studies.runner import on_this_machine, run_study, work
 from jbrep.studies.tables import (
     REFERENCE_RETURNS,
     RETURNS,
-    read_curves,
     write_tables,
 )
 
@@ -502,12 +501,12 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
     if name != RUN:
         adopt(tmp_path / RUN, name)
     with pytest.raises(InputError, match=message):
-        read_curves(tmp_path)
+        write_tables(tmp_path)
 
 
 def test_a_folder_without_runs_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no finished run below .* train one with jbrep rl"):
-        read_curves(tmp_path)
+        write_tables(tmp_path)
 
 
 def test_a_run_is_played_before_and_after_training_with_another_body(done):

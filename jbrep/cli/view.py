@@ -79,9 +79,9 @@ def render(
     episode: _Number = 0,
     camera: str | None = None,
     size: Annotated[str, Meta(extra={"metavar": "WIDTHxHEIGHT"})] = "",
-    fps: float | None = None,
-    speed: float = 1.0,
-    seconds: float | None = None,
+    fps: Annotated[float, Meta(ge=1, le=50)] | None = None,
+    speed: Annotated[float, Meta(ge=0.01, le=100)] = 1.0,
+    seconds: Annotated[float, Meta(ge=0.001, le=3600)] | None = None,
 ) -> None:
     """Make a video of episodes, side by side.
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import mujoco
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
@@ -10,19 +9,14 @@ from numpy.typing import NDArray
 from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array, Task
 from jbrep.inspection.recording import SKY, Recording, pieces
-from jbrep.inspection.robot import XYZW, Robot
+from jbrep.inspection.robot import Robot
 from jbrep.jitterbug.tasks import MOTOR_QPOS, POSITION, QPOS_SIZE, QUATERNION
 
 WORLD = "world"
 ROBOT = f"{WORLD}/robot"
 SURROUNDINGS = f"{WORLD}/surroundings"
-FLOOR = f"{WORLD}/floor"
 TRAIL = f"{WORLD}/trail"
-_FLOOR_COLOUR = (58, 66, 80)
-# in sizes of the robot
-_FLOOR_MARGIN = 4.0  # beyond the path
-_FLOOR_THICKNESS = 0.013
-_TRAIL_RADIUS = 0.008
+_TRAIL_RADIUS = 0.008  # in sizes of the robot
 GHOST = "world/ghost"
 _OPACITY = 170  # of 255
 _RANGE = (1e-3, 1e-1)  # [m] errors at the ends of the colour scale, which is logarithmic
@@ -41,35 +35,9 @@ def send_scene(
     recording.send(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     robot.draw(recording, ROBOT, times, poses, robot.bodies)
     robot.draw(recording, SURROUNDINGS, times, poses, robot.others)
-    send_floor(recording, robot, path)
     radius = _TRAIL_RADIUS * robot.size
     ground = np.column_stack((path[:, :2], np.full(len(path), radius)))
     recording.send_moving(TRAIL, times, rr.LineStrips3D, SKY, radius, strips=pieces(ground))
-
-
-def send_floor(recording: Recording, robot: Robot, path: Array) -> None:
-    """Send the model's planes as slabs that reach beyond a path (n, 3), or as far as they do."""
-    model, data = robot.model, mujoco.MjData(robot.model)
-    mujoco.mj_kinematics(model, data)
-    margin, thick = _FLOOR_MARGIN * robot.size, _FLOOR_THICKNESS * robot.size
-    for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
-        turned = data.geom_xmat[plane].reshape(3, 3)
-        along = (path - data.geom_xpos[plane]) @ turned  # in the plane's frame
-        ends = np.where(model.geom_size[plane, :2] > 0, model.geom_size[plane, :2], np.inf)
-        low = np.clip(along.min(axis=0)[:2] - margin, -ends, ends)
-        high = np.clip(along.max(axis=0)[:2] + margin, -ends, ends)
-        centre = np.array([*(low + high) / 2, -thick])
-        quaternion = np.empty(4)
-        mujoco.mju_mat2Quat(quaternion, data.geom_xmat[plane])
-        slab = rr.Boxes3D(
-            half_sizes=[(*(high - low) / 2, thick / 2)],
-            centers=[data.geom_xpos[plane] + turned @ centre],
-            quaternions=[quaternion[XYZW]],
-            colors=[_FLOOR_COLOUR],
-            fill_mode=rr.components.FillMode.Solid,
-        )
-        name = model.geom(plane).name or f"plane_{plane}"
-        recording.send(f"{FLOOR}/{rr.escape_entity_path_part(name)}", slab)
 
 
 def as_qpos(task: Task, observation: Array) -> Array:

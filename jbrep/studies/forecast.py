@@ -27,12 +27,7 @@ class Forecast(NamedTuple):
 
 
 def forecast(plan: Plan, workers: int | None = None) -> Forecast:
-    """The runs to go, and how long they would take, estimated from a few steps of each learner.
-
-    Args:
-        plan: the study.
-        workers: how many processes would go on at a time; by default as many as are usual.
-    """
+    """The runs to go, and how long they would take, estimated from a few steps of each learner."""
     check(plan)
     plan.check_folder()
     workers, cells = workers or usual_workers(plan), plan.unfinished

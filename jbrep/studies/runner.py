@@ -107,16 +107,13 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
     """
     jobs = map(plan.assigned, cells)
     train = partial(work, modules=imported_modules())
-    ended = side_by_side(
-        train, lambda: next(jobs, None), workers, _PATIENCE, stopping=_announce_stop
+    told = partial(
+        say, "stopping: the runs under way write their checkpoints; Ctrl-C again ends all"
     )
+    ended = side_by_side(train, lambda: next(jobs, None), workers, _PATIENCE, told)
     with closing(ended):
         for job, outcome in ended:
             yield outcome or _killed(job.name)
-
-
-def _announce_stop() -> None:
-    say("stopping: the runs under way write their checkpoints; Ctrl-C again ends them at once")
 
 
 def _killed(name: str) -> Outcome:
@@ -164,11 +161,6 @@ def run_study(
 
     A study with claims is registered first: beside its file, in a commit, where git has that file.
     At last the policies play that agents are compared with.
-
-    Args:
-        plan: the study.
-        backend: what runs it.
-        workers: how many processes go on at a time; by default as many as are usual.
 
     Returns:
         How many runs crashed.
