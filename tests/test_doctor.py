@@ -53,12 +53,6 @@ def test_it_draws_something_to_see_whether_it_can(monkeypatch):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_it_fits_the_terminal(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "60")
-    assert max(map(len, jbrep("doctor").output.splitlines())) <= 60
-
-
-@pytest.mark.usefixtures("undrawn")
 def test_every_extra_is_examined():
     project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
     assert set(doctor.extras()) == {*project["optional-dependencies"]}

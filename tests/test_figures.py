@@ -2,7 +2,6 @@
 
 import csv
 import io
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from PIL import Image
 from jbrep.evaluation.evaluation import Score
 from jbrep.reporting.figures import study_plots, write
 from jbrep.reporting.figures.panels import COLUMN, PAGE, PAPER, fitting
-from jbrep.reporting.findings import Verdict
 from jbrep.stats import RunCurve, analyse
 
 STEPS = np.arange(0, 50_001, 10_000)
@@ -120,31 +118,6 @@ def of_runs(some, played=IN_TRAINING):
     return found_of(analyse(some), some, played)
 
 
-def of_first_group(name):
-    key = (*GROUPS[0], name)
-    return [run for run in runs() if (run.task, run.algorithm, run.representation) == key]
-
-
-def test_every_run_is_drawn(plots, found):
-    (axes, *_) = drawn(plots["every_run"]).axes
-    assert len([line for line in axes.lines if len(line.get_xdata()) == len(STEPS)]) == 4
-    key = {"task": GROUPS[0][0], "algorithm": GROUPS[0][1], "representation": "full", "seed": 0}
-    (run,) = [r for r in found.runs if (r.label, r.seed) == ("face_direction/ddpg/full", 0)]
-    assert values(plots["every_run"], "mean_return", **key) == [mean for _, mean in run.curve]
-
-
-def test_a_point_for_each_run_and_an_interval_for_each_representation(plots, found):
-    agents = found.groups[0].agents
-    axes = drawn(plots["final_return"]).axes[0]
-    points = [drawn for drawn in axes.lines if drawn.get_marker() == "."]
-    for dots, each in zip(points, agents, strict=True):
-        np.testing.assert_array_equal(dots.get_ydata(), each.by_run["final_return"])
-    bars = [bar for bar in axes.lines if len(bar.get_ydata()) == 2 and 0.1 < bar.get_xdata()[1] < 9]
-    bars = [bar for bar in bars if bar.get_xdata()[0] == bar.get_xdata()[1]]
-    for bar, each in zip(bars, agents, strict=True):
-        np.testing.assert_allclose(bar.get_ydata(), each.numbers["final_return_mean"][1:])
-
-
 def with_numbers(found, where, name, score):
     """The first group alone, in which one number is another."""
     group = found.groups[0]
@@ -190,27 +163,6 @@ def test_differences_from_the_baseline_stand_with_their_intervals(found):
     assert texts == ["dae-8 - full", "pca-4 - full"]
 
 
-def test_claims_stand_in_their_place_with_boundaries_and_what_was_tested(found):
-    verdict = Verdict(
-        **{"task": "face_direction", "algorithm": "ddpg", "x": "dae-8", "y": "pca-4"},
-        **{"claim": "not worse", "verdict": "supported", "boundary": -90.0, "width": 700.0},
-        **{"p": 0.01, "level": 0.05, "runs": 4, "units": 4, "by_encoder": False},
-        **{"by": None, "reason": None},
-        estimate=Score(200.0, 150.0, 250.0),
-        interval=Score(200.0, 145.0, 255.0),
-    )
-    faster = verdict.replace(claim="faster", estimate=Score(-1e4, -2e4, 0.0))
-    axes, rows = difference_panel(found.replace(verdicts=[verdict, faster]))
-    bars = {
-        line.get_linewidth(): [*line.get_xdata()]
-        for line in axes.lines
-        if len(line.get_xdata()) == 2
-    }
-    assert (bars[0.8], bars[2], bars[0.9]) == ([145, 255], [150, 250], [-90, -90])
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["dae-8 not worse than pca-4"]
-    assert rows[0]["representation"] == "dae-8"
-
-
 def test_limits_hold_what_is_near_and_not_what_is_far():
     returns = [-400.0, -100.0, np.nan]
     assert fitting(returns) == pytest.approx((-412, -88))
@@ -221,31 +173,11 @@ def test_limits_hold_what_is_near_and_not_what_is_far():
     assert fitting([0.2, 0.2]) == pytest.approx((-0.3, 0.7))
 
 
-def test_a_profile_falls_from_all_runs_to_none(plots, found):
-    for group in found.groups:
-        shares = [share.value for share in group.agents[0].profile]
-        assert (shares[0], shares[-1]) == (1, 0)
-        assert np.all(np.diff(shares) <= 0)
-        key = {"task": group.task, "algorithm": group.algorithm, "representation": "full"}
-        assert values(plots["profiles"], "value", **key) == shares
-    assert {row["task"] for row in plots["profiles"].rows if row["number"] == "score"} == {
-        "2 tasks"
-    }
-
-
 def test_without_statistics_the_runs_are_drawn_all_the_same(found):
     assert [plot.name for plot in study_plots(found.replace(groups=[], aggregates=[]))] == [
         "every_run"
     ]
     assert study_plots(found.replace(groups=[], aggregates=[], runs=[])) == []
-
-
-def test_names_and_policies_with_dollar_signs_are_no_formulas():
-    odd = [replace(run, representation="$x^{") for run in of_first_group("full")]
-    for plot in study_plots(
-        of_runs([*of_first_group("full"), *odd], {"face_direction": {"$y^{": 300.0}})
-    ):
-        drawn(plot).canvas.draw()
 
 
 def test_diagnostics_stand_against_final_returns(found):

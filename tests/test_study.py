@@ -26,11 +26,8 @@ from command import (
 from small import adopt, forge
 
 from jbrep.encoders import load
-from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.play.sources import find_player
 from jbrep.reporting.findings import Findings
-from jbrep.reporting.report import results_text
 from jbrep.reporting.tables import read_tables
 from jbrep.rl.files import CHECKPOINT, RUN, read_run
 from jbrep.rl.presets import PRESETS, get_preset
@@ -39,7 +36,6 @@ from jbrep.studies.config import Data, Study, as_study, read_study
 from jbrep.studies.forecast import forecast
 from jbrep.studies.plan import PROGRESS, STUDY, Plan, read_plan
 from jbrep.studies.prepare import check, prepare
-from jbrep.studies.record import RunsRecord
 from jbrep.studies.representations import ByName
 from jbrep.studies.runner import on_this_machine, run_study, work
 from jbrep.studies.tables import (
@@ -166,18 +162,6 @@ def test_what_a_study_can_not_show_is_said_first(tmp_path, monkeypatch):
     assert max(map(len, told.stderr.splitlines())) <= 80
 
 
-def test_a_study_is_read_without_its_environments(tmp_path, monkeypatch):
-    """Their package may be gone by then."""
-    monkeypatch.setattr("jbrep.studies.plan.describe", None)
-    settings = {**TINY.as_json(), "tasks": ["Robots/Gone-v0"], "environment": {"g": 1}}
-    forge(tmp_path / STUDY, settings)
-    plan = read_plan(tmp_path)
-    assert plan.study.environment == {"g": 1}
-    names = [cell.name for cell in plan.unfinished]
-    assert names[0] == "Robots-Gone-v0/a2c/full/seed-0"
-    assert plan.data("Robots/Gone-v0") == tmp_path / "data" / "Robots-Gone-v0"
-
-
 def test_arguments_and_time_limit_are_those_of_the_environments(tmp_path):
     study = TINY.replace(tasks=("Pendulum-v1",), environment={"g": 1.6}, episode_steps=70)
     plan = Plan(study, tmp_path)
@@ -208,11 +192,6 @@ def test_what_the_environment_rules_out_is_said_first(changes, message, tmp_path
     with pytest.raises(InputError, match=message):
         run_study(Plan(study.replace(**changes), tmp_path / "it"), None, 1)
     assert not (tmp_path / "it").exists()
-
-
-def test_coordinates_need_no_data_and_no_file(tmp_path):
-    study = TINY.replace(tasks=("Hopper-v5",), representations=("full", "coordinates"))
-    check(Plan(study, tmp_path / "it"))
 
 
 @pytest.mark.parametrize("way", [(), ("--register",), ("--dry-run",)])
@@ -255,12 +234,6 @@ def test_two_workers_of_which_one_is_killed_give_the_same_tables(done, tmp_path)
     assert tables(plan.folder) == tables(done.folder)
 
 
-def test_a_setting_that_is_left_out_now_makes_another_study(tmp_path):
-    Plan(TINY.replace(domain={"delay": "0..2"}), tmp_path).write()
-    with pytest.raises(InputError, match=r"another study: domain .* \(now: none\)"):
-        Plan(TINY, tmp_path).write()
-
-
 def test_what_is_finished_is_not_run_again_and_seeds_may_come(done, tmp_path, monkeypatch):
     grown = Plan(TINY.replace(seeds=(0, 1, 2)), done.folder)
     assert [cell.name for cell in grown.unfinished] == [
@@ -285,12 +258,6 @@ def test_a_study_that_is_refused_changes_nothing(done, tmp_path):
     with pytest.raises(InputError, match="seed-0"):
         run_study(Plan(TINY.replace(seeds=(0, 1, 2)), folder), None, 1)
     assert (folder / STUDY).read_bytes() == before
-
-
-def test_other_runs_in_its_folder_draw_nothing(done):
-    ended = {path.parent: read_run(path.parent) for path in done.folder.rglob(RUN)}
-    record = RunsRecord.of(done.folder, ended)
-    assert record.draws_of("sac+learning_starts=120") == {}
 
 
 def test_it_makes_data_and_encoders(tmp_path):
@@ -361,13 +328,6 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
 
 
-def test_each_run_says_which_module_is_not_here(tmp_path):
-    plan = Plan(TINY.replace(representations=("full",)), tmp_path)
-    ended = [work(plan.assigned(cell), modules=["robots_elsewhere"]) for cell in plan.cells]
-    assert [each.status for each in ended] == ["crashed"] * 2
-    assert all("can't import robots_elsewhere" in each.message for each in ended)
-
-
 def tables_with(plan, folder, runs, **settings):
     """The tables of a study of which some runs have other settings."""
     shutil.copytree(plan.folder / "runs", folder / "runs")
@@ -415,11 +375,6 @@ def test_a_stopped_study_leaves_checkpoints_and_no_workers(tmp_path):
     told = jbrep("report", out)
     assert told.exit_code == 2
     assert told.stderr == f"Error: no finished run below {out}: jbrep study resumes it\n"
-
-
-def test_tables_fit_the_terminal(done):
-    write_tables(done.folder)
-    assert max(map(len, results_text(Findings.of(read_tables(done.folder)), 80).splitlines())) <= 80
 
 
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
@@ -502,17 +457,6 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
         adopt(tmp_path / RUN, name)
     with pytest.raises(InputError, match=message):
         write_tables(tmp_path)
-
-
-def test_a_folder_without_runs_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"no finished run below .* train one with jbrep rl"):
-        write_tables(tmp_path)
-
-
-def test_a_run_is_played_before_and_after_training_with_another_body(done):
-    run = done.folder / "runs" / "face_direction" / "a2c" / "full" / "seed-0"
-    other = describe("face_direction", {"body": 7}, 100)
-    assert find_player(str(run), other).task == other
 
 
 def test_a_study_for_a_gpu_is_read_where_there_is_none(tmp_path, monkeypatch):

@@ -1,11 +1,9 @@
 """Tables and facts that fit a terminal; progress on a terminal and in a log."""
 
-import io
 import subprocess
 import sys
 
-from jbrep.progress import Progress
-from jbrep.text import duration, facts, slug, table, words
+from jbrep.text import facts, slug, table, words
 
 HEADER = ("encoder", "error", "ratio", "worst feature")
 ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "motor_angle")]
@@ -14,12 +12,6 @@ import jbrep.progress as p, time
 p._LOG_EVERY = 0.3
 for _ in p.Progress(range(10), desc="steps", unit="step", initial=5, total=15):
     time.sleep(0.05)
-"""
-SHORT = """
-import jbrep.progress as p
-with p.Progress(total=3) as bar:
-    bar.update()
-    bar.set_postfix(error=1)
 """
 
 
@@ -48,27 +40,12 @@ def test_facts_are_wrapped_below_themselves():
     assert all(line.startswith(" " * 7) for line in shown[2:])
 
 
-def test_in_a_notebook_progress_is_a_bar(monkeypatch):
-    class Cell(io.StringIO):
-        __module__ = "ipykernel.iostream"
-
-    monkeypatch.setattr(sys, "stderr", Cell())
-    with Progress(total=3) as bar:
-        bar.update(3)
-    assert "\r100%|" in sys.stderr.getvalue()
-
-
 def test_in_a_log_progress_is_a_line_now_and_then():
     done = subprocess.run([sys.executable, "-c", STEPS], capture_output=True, text=True, check=True)
     lines = done.stderr.splitlines()
     assert 1 <= len(lines) < 10
     assert all(line.startswith("steps: ") and " of 15 [" in line for line in lines)
     assert "\r" not in done.stderr
-
-
-def test_short_work_leaves_nothing_in_a_log():
-    done = subprocess.run([sys.executable, "-c", SHORT], capture_output=True, text=True, check=True)
-    assert done.stderr == ""
 
 
 def test_a_closed_standard_error_stops_nothing():
@@ -80,8 +57,3 @@ def test_a_slug_has_hyphens_for_what_a_path_should_not_hold():
     assert slug("dm_control/cheetah-run-v0") == "dm_control-cheetah-run-v0"
     assert slug("my_package:Env-v0 \u00e9\n..") == "my_package-Env-v0---.."
     assert slug("face_direction") == "face_direction"
-
-
-def test_durations_as_text():
-    told = [duration(seconds) for seconds in (12.4, 300, 90 * 60, 1e6)]
-    assert told == ["12 s", "5.0 min", "1.5 h", "277.8 h"]

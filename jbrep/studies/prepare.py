@@ -199,7 +199,7 @@ class Made:
             episodes = usual_shard_episodes(settings, self.folder, policy)
             settings = settings.replace(shard_episodes=episodes)
             collect(settings, self.folder, num_threads=threads, policy=policy)
-            say(f"{self}: {settings.steps:,} steps")
+            say(f"{self}: {read_manifest(self.folder).rows:,} states")
         fitter = self.fitter()
         for name, kind, given in self.fits():
             if fitter.fit(kind, name=name, **given).is_new:
