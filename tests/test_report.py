@@ -28,6 +28,7 @@ from jbrep.reporting.findings import Findings
 from jbrep.reporting.report import (
     FINDINGS,
     MARKDOWN,
+    PAGE,
     commands,
     results_text,
     summary,

@@ -194,19 +194,6 @@ def test_what_the_environment_rules_out_is_said_first(changes, message, tmp_path
     assert not (tmp_path / "it").exists()
 
 
-@pytest.mark.parametrize("way", [(), ("--register",), ("--dry-run",)])
-def test_data_whose_seeds_an_environment_does_not_take_are_refused_first(way, tmp_path):
-    pytest.importorskip("shimmy")
-    tasks = 'tasks = ["face_direction", "dm_control/cartpole-swingup-v0"]'
-    path = written(tmp_path, tasks, 'representations = ["full"]', "[data]\nseed = 2_045\nsets = 3")
-    path.write_text(f"{path.read_text()}\nsteps = 9")  # of the data
-    told = jbrep("study", path, "--out", tmp_path / "it", *way)
-    refusal = "Error: dm_control/cartpole-swingup-v0 takes seeds of 31 bits: the data set's seed "
-    assert told.exit_code == 2, told.output
-    assert told.stderr.splitlines()[-1].startswith(f"{refusal}must be at most 2,046")
-    assert not (tmp_path / "it").exists()
-
-
 def test_every_cell_has_its_run(done):
     assert len({cell.name for cell in done.cells}) == 4
     for cell in done.cells:
@@ -326,16 +313,6 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     analysis = read_tables(plan.folder).analysis
     failed = {group.algorithm: [len(x.failed) for x in group.labels] for group in analysis.groups}
     assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
-
-
-def tables_with(plan, folder, runs, **settings):
-    """The tables of a study of which some runs have other settings."""
-    shutil.copytree(plan.folder / "runs", folder / "runs")
-    for path in folder.rglob(f"{runs}/{RUN}"):
-        run = json.loads(path.read_text())
-        forge(path, {**run, "settings": {**run["settings"], **settings}})
-    write_tables(folder)
-    return read_tables(folder)
 
 
 @pytest.mark.usefixtures("one_figure")

@@ -6,15 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up import write_record
 
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.methods.registry import METHODS
-from jbrep.records.tables import write_rows
-from jbrep.rl import Run
-from jbrep.rl.files import EPISODES, Episode
 from jbrep.stats.association import rank_correlation
 from jbrep.training.method import Learned
 
@@ -56,34 +52,6 @@ def test_the_overview_of_encoders_is_the_one_on_their_page(capsys, monkeypatch):
     rows = {line for line in lines[2:] if line.split("|")[1].strip() != "full"}
     assert len(rows) > 20
     assert not [line for line in rows if line not in page]
-
-
-def test_the_best_agent_is_the_best_at_the_end_of_training(tmp_path):
-    import policies
-
-    for seed, late in ((0, 300.0), (1, 500.0), (2, 400.0)):
-        folder = tmp_path / "study" / str(seed)
-        folder.mkdir(parents=True)
-        run = Run.of(FACE, "sac", seed=seed, steps=1000, preset="paper")
-        write_record(folder, run)
-        returns = ((500, 900.0 - late), (1000, late))
-        rows = [Episode(s, i, v, 100, False) for s, v in returns for i in range(policies.LAST)]
-        write_rows(folder / EPISODES, rows, Episode)
-    assert policies.best([tmp_path]) == {FACE: (500.0, tmp_path / "study" / "1")}
-
-
-def test_the_search_for_a_gait_tells_constants_and_returns(capsys, monkeypatch):
-    import tune_heuristics as tool
-
-    short = describe(FACE).replace(max_episode_steps=20)
-    monkeypatch.setattr(tool, "describe", lambda name: short)
-    for name, value in (("SEARCH_EPISODES", 2), ("TEST_EPISODES", 2), ("REPORT_EVERY", 1)):
-        monkeypatch.setattr(tool, name, value)
-    monkeypatch.setattr(sys, "argv", ["tune", FACE, "--minutes", "0.001"])
-    tool.main()
-    told = capsys.readouterr().out.splitlines()
-    assert told[0].startswith("generation 1: ")
-    assert "Turn(" in told[0]
 
 
 def test_scores_are_compared_on_the_same_resamples():
