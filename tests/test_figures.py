@@ -9,7 +9,6 @@ from judged import NOTHING
 from made_up import drawn, found_of
 from PIL import Image
 
-from jbrep.evaluation.evaluation import Score
 from jbrep.reporting.figures import study_plots, write
 from jbrep.reporting.figures.panels import COLUMN, PAGE, PAPER, fitting
 from jbrep.stats import RunCurve, analyse
@@ -116,35 +115,6 @@ def test_a_representation_has_one_colour_in_all_figures(found):
 
 def of_runs(some, played=IN_TRAINING):
     return found_of(analyse(some), some, played)
-
-
-def with_numbers(found, where, name, score):
-    """The first group alone, in which one number is another."""
-    group = found.groups[0]
-    first, *others = getattr(group, where)
-    changed = first.replace(numbers={**first.numbers, name: Score(*score)})
-    return found.replace(groups=[group.replace(**{where: [changed, *others]})])
-
-
-def cut_marks(axes, markers):
-    return [
-        (line.get_xdata()[0], line.get_ydata()[0], line.get_marker())
-        for line in axes.lines
-        if line.get_marker() in markers and not line.get_clip_on()
-    ]
-
-
-def test_no_interval_stretches_an_axis_and_cuts_are_marked(found):
-    final, *_ = study_plots(with_numbers(found, "agents", "final_return_sd", (40, 2, 5000)))
-    axes = drawn(final).axes[1]
-    largest = max(each.numbers["final_return_sd"].value for each in found.groups[0].agents)
-    assert axes.get_ylim()[1] < 4 * largest < 5000
-    assert (0.16, axes.get_ylim()[1], "^") in cut_marks(axes, "v^")
-    far = with_numbers(found, "agents", "final_return_mean", (500, -9000, 9000))
-    axes = drawn(study_plots(far)[0]).axes[0]
-    low, high = axes.get_ylim()
-    assert -600 < low < high < 1600
-    assert cut_marks(axes, "v^")[:2] == [(0.16, low, "v"), (0.16, high, "^")]
 
 
 def difference_panel(found):

@@ -1,8 +1,7 @@
 """Recordings hold what they were made from, as Rerun's own reader finds it."""
 
-import json
 import re
-import sys
+import subprocess
 from pathlib import Path
 
 import mujoco
@@ -451,30 +450,14 @@ def test_the_command_names_the_file_after_its_content(tmp_path, monkeypatch):
     assert "inspect/move_to_pose-uniform-episode-0-dae-4-traverse.rrd\n" in told
 
 
-@pytest.fixture
-def viewer(tmp_path, monkeypatch):
-    """A program in the place of Rerun's, which tells its arguments and its process."""
+def test_the_viewer_is_rerun_itself(brief, tmp_path, monkeypatch):
+    called = []
 
-    def make(then):
-        path = tmp_path / "viewer.py"
-        told = tmp_path / "told.json"
-        path.write_text(
-            f"#!{sys.executable}\n"
-            "import json, os, pathlib, sys, time\n"
-            f"told = pathlib.Path({str(told)!r})\n"
-            "told.with_suffix('.new').write_text(json.dumps([os.getpid(), *sys.argv[1:]]))\n"
-            "told.with_suffix('.new').rename(told)\n"
-            f"{then}\n"
-        )
-        path.chmod(0o755)
-        monkeypatch.setenv("RERUN_CLI_PATH", str(path))
-        return told
+    def run(command, **given):
+        called.append(command)
+        return subprocess.CompletedProcess(command, 3)
 
-    return make
-
-
-def test_the_viewer_is_rerun_itself(viewer, brief, tmp_path):
-    told, out = viewer("sys.exit(3)"), tmp_path / "it.rrd"
-    shown = jbrep("inspect", brief, "--out", out, "--view")
-    assert json.loads(told.read_text())[1:] == ["--bind", "127.0.0.1", str(out)]
-    assert shown.exit_code == 2
+    monkeypatch.setattr("jbrep.cli.view.subprocess.run", run)
+    out = tmp_path / "it.rrd"
+    assert jbrep("inspect", brief, "--out", out, "--view").exit_code == 2
+    assert called[0][1:] == ["-m", "rerun", "--bind", "127.0.0.1", str(out)]

@@ -18,7 +18,7 @@ from jbrep.envs.names import import_modules
 from jbrep.envs.physics import physics_of
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import plain_model
-from jbrep.play.film import Film, Pace, encode_gif, encode_mp4
+from jbrep.play.film import Film, Pace, encode_mp4
 from jbrep.play.pictures import Camera, add_caption, band_height, find_camera
 from jbrep.play.sources import find_episode
 
@@ -178,15 +178,6 @@ def test_a_caption_keeps_to_its_band_and_to_its_room():
         add_caption(one, name, "return 712    9.96 s")
         add_caption(other, shown, "return 712    9.96 s")
         assert one == other
-
-
-def test_a_gif_keeps_the_colour_of_what_is_small(tmp_path):
-    floor = np.random.default_rng(0).integers(80, 200, (2, 60, 80, 3), dtype=np.uint8)
-    floor[:, 30:34, 40:44] = (220, 40, 30)
-    encode_gif(map(Image.fromarray, floor), tmp_path / "a.gif", 10)
-    frames, durations, _ = read_gif(tmp_path / "a.gif")
-    np.testing.assert_allclose(frames[0][32, 42], (220, 40, 30), atol=25)
-    assert durations == [100, 100]
 
 
 def test_an_mp4_keeps_what_it_is_given(tmp_path):

@@ -34,7 +34,7 @@ from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.stats.rules import Rules
 from jbrep.studies.config import Data, Study, as_study, read_study
 from jbrep.studies.forecast import forecast
-from jbrep.studies.plan import PROGRESS, STUDY, Plan, read_plan
+from jbrep.studies.plan import PROGRESS, STUDY, Plan
 from jbrep.studies.prepare import check, prepare
 from jbrep.studies.representations import ByName
 from jbrep.studies.runner import on_this_machine, run_study, work
@@ -160,17 +160,6 @@ def test_what_a_study_can_not_show_is_said_first(tmp_path, monkeypatch):
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
     assert "This study compares nothing: it has one" in told.stderr
     assert max(map(len, told.stderr.splitlines())) <= 80
-
-
-def test_arguments_and_time_limit_are_those_of_the_environments(tmp_path):
-    study = TINY.replace(tasks=("Pendulum-v1",), environment={"g": 1.6}, episode_steps=70)
-    plan = Plan(study, tmp_path)
-    task = plan.run(plan.cells[0]).task
-    assert (task.id, task.arguments, task.max_episode_steps) == ("Pendulum-v1", {"g": 1.6}, 70)
-    plan.write()
-    other = Plan(study.replace(environment={"g": 9.8}), tmp_path)
-    with pytest.raises(InputError, match=r"another study: environment\.g 1\.6 \(now: 9\.8\)"):
-        other.write()
 
 
 @pytest.mark.parametrize(
@@ -405,13 +394,6 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     assert "--import PACKAGE" in refused.stderr  # its file names no module
 
 
-def test_one_study_at_a_time(done):
-    from jbrep.records.storage import exclusive
-
-    with exclusive(done.folder), pytest.raises(InputError, match="is being written by process"):
-        run_study(done, on_this_machine, 1)
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -434,15 +416,6 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
         adopt(tmp_path / RUN, name)
     with pytest.raises(InputError, match=message):
         write_tables(tmp_path)
-
-
-def test_a_study_for_a_gpu_is_read_where_there_is_none(tmp_path, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    study = TINY.replace(algorithms=("sac",), device="cuda")
-    Plan(study, tmp_path).write()
-    assert read_plan(tmp_path).study.device == "cuda"
-    with pytest.raises(InputError, match="no device 'cuda' on this machine: choose auto or cpu"):
-        run_study(Plan(study, tmp_path), on_this_machine, 1)
 
 
 def test_what_a_run_killed_at_its_very_end_left_is_removed(done):

@@ -5,7 +5,6 @@ import shutil
 import tomllib
 from pathlib import Path
 
-import numpy as np
 import onnx
 import pytest
 from command import in_this_process, jbrep
@@ -15,7 +14,6 @@ from small import forge
 from test_convert import model
 from test_study import TINY as TINY_STUDY
 
-from jbrep.dataset import Dataset
 from jbrep.encoders import find, load, save
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
@@ -271,36 +269,6 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     assert runs["late-4", 0].find_encoder().name == "late-4"
     (exploratory,) = study.replace(seeds=(0, 1)).notices
     assert exploratory.startswith("This study is exploratory")
-
-
-def test_each_encoder_of_several_learns_from_its_own_data(tmp_path):
-    """Of two data sets, the third encoder learns from the first again, with another seed."""
-    tasks = (TASK, "move_in_direction")
-    several = ({"name": "pca-4", "encoders": 2}, {"name": "random-4", "encoders": 3}, "full")
-    study = TINY.replace(
-        tasks=tasks,
-        representations=several,
-        seeds=tuple(range(6)),
-        data={"": Data(steps=400, seed=5, sets=2)},
-    )
-    plan = Plan(study, tmp_path / "it")
-    prepare(plan)
-    for task in tasks:
-        made = {path.stem: load(path).header for path in plan.encoders(task).glob("*.safetensors")}
-        learned = {name: header.data["seed"] for name, header in made.items()}
-        assert learned == {
-            **{"pca-4-s0": 5, "pca-4-s1": 6, "full": 5},
-            **{"random-4-s0": 5, "random-4-s1": 6, "random-4-s2": 5},
-        }
-        assert made["random-4-s2"].training["seed"] == 2
-        runs = [plan.run(cell) for cell in plan.cells if cell.task == task]
-        assert [Path(run.encoder).stem for run in runs[:4]] == [
-            *("pca-4-s0", "random-4-s0", "full", "pca-4-s1")
-        ]
-        first, second = (Dataset(plan.data(task, number)) for number in range(2))
-        assert first.manifest.settings.seed == 5
-        assert not np.array_equal(first["observation"][:], second["observation"][:])
-    assert not (tmp_path / "it" / "data" / TASK / "manifest.json").exists()
 
 
 @pytest.mark.parametrize(
