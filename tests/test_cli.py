@@ -72,7 +72,7 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
     assert re.search(r"\nface_direction/a2c/pca-8 +2 +[\d.]+ \w+\n", told)
     assert re.search(r"4 runs to go, 0 done; [\d.]+ \w+ on one core, [\d.]+ \w+ with 2 ", told)
     for arguments, message in (
-        (("studies/none.toml",), "no study at studies/none.toml"),
+        (("studies/none.toml",), "studies/none.toml"),
         (
             ("studies/demo.toml", "--backend", "slurm"),
             "unknown backend 'slurm': choose one of local, ray",

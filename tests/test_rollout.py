@@ -179,7 +179,6 @@ def test_what_can_t_be_simulated_here_is_shown_as_stored(hopper):
     [
         ("nowhere", 0, None, "nowhere is no data set, no run with a policy or checkpoint, and no"),
         ("heuristic", 0, None, "policy heuristic needs a --task"),
-        ("heuristic", -1, "face_direction", "there is no episode -1"),
         ("heuristic", 0, "Pendulum-v1", "Pendulum-v1 has no hand-written policy"),
         ("data/sample/face_direction", 4, None, "has no episode 4: it has 4, numbered from 0"),
         ("data/sample/face_direction", 0, "move_to_pose", "is of face_direction, not of move_to"),

@@ -44,14 +44,11 @@ def study(
             version, before the first run.
     """
     from jbrep.records.document import read_toml
-    from jbrep.records.storage import exists
 
     if dry_run and register:
         raise InputError("--dry-run and --register exclude each other: choose one")
     if register and (workers or backend != "local"):
         raise InputError("--register runs nothing: leave out --workers and --backend")
-    if not exists(study):
-        raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)
     from jbrep.studies.runner import BACKENDS  # imports torch
 

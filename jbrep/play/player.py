@@ -13,11 +13,9 @@ from jbrep.envs.make import is_batched
 from jbrep.envs.physics import MotionReader
 from jbrep.envs.recording import Actor, Outcome, Recording, joined, record, whole_outcome
 from jbrep.envs.task import Array, Task
-from jbrep.errors import InputError
 from jbrep.play.rollout import Rollout
 from jbrep.progress import Progress
 from jbrep.rl.files import EVALUATION_SEED
-from jbrep.rl.settings import MAX_EPISODES
 
 Begin = Callable[[Task, Sequence[int]], Actor]  # as `Policy.begin`
 
@@ -102,7 +100,6 @@ class Player(NamedTuple):
         most = _BATCH_LANES
         if not is_batched(self.task):
             most = min(threads or _SEPARATE_LANES, _SEPARATE_LANES)
-        check_episodes(count)
         played = 0
         with _progress(count * self.task.max_episode_steps) as bar:
             while played < count:
@@ -135,9 +132,3 @@ class Player(NamedTuple):
 
 def _progress(steps: int) -> Progress:
     return Progress(total=steps, unit="step", unit_scale=True, leave=False, delay=1)
-
-
-def check_episodes(count: int) -> None:
-    """Make sure that an evaluation may have so many episodes."""
-    if count > MAX_EPISODES:
-        raise InputError(f"{count:,} episodes are too many: at most {MAX_EPISODES:,} are played")

@@ -46,10 +46,7 @@ def find_episode(
                 f"{source} has its own arguments, time limit and features: leave out --task"
             )
         return replay(dataset, episode)
-    player = find_player(source, task, encoder)
-    if episode < 0:
-        raise InputError(f"there is no episode {episode}: they count from 0")
-    return player.play_one(episode)
+    return find_player(source, task, encoder).play_one(episode)
 
 
 def find_policy(text: str, folder: Path, task: Task) -> Policy:
