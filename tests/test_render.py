@@ -199,7 +199,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(tmp_path, monkeypatch):
         *(("a.avi", "--out", "a.avi"), ("there.mp4", "--out", "there.mp4")),
         *(("camera", "--camera", "side"), ("640x480", "--size", "640")),
         *(("641x480", "--size", "641x480"), ("even", "--size", "9000x9000")),
-        *(("frames", "--fps", 0), ("speed", "--speed", "nan"), ("seconds", "--seconds", 0)),
+        *(("fps", "--fps", 0), ("speed", "--speed", "nan"), ("seconds", "--seconds", 0)),
         *(("start", "--episode", 1, "uniform"), ("episode 4", "--episode", 4)),
         *(("nowhere", "nowhere"), ("wide", "--size", "3840x64", "uniform", "uniform")),
     ):
