@@ -70,7 +70,7 @@ pictures: $(READY) ## the pictures in docs/, drawn anew
 docs: $(READY) ## the documentation as a site, in site/
 	$(BIN)/python tools/site.py site
 
-figures: $(READY) ## figures and reports in results/ anew, from the tables there
+figures: $(READY) ## reports in results/ with their figures anew, from the tables there
 	$(BIN)/python tools/figures.py
 
 samples: $(READY) ## the sample data sets in data/, made anew

@@ -88,17 +88,6 @@ class Agent(NamedTuple):
             return f"Agent({what}: {self.record.reason})"
         return f"Agent({what}: {returns_text(self.returns)}; {str(self.folder)!r})"
 
-    def _repr_html_(self) -> str:
-        from jbrep.rl.files import read_evaluations
-        from jbrep.text import Table, html, interval_of
-
-        returns: dict[int, list[float]] = {}
-        for each in read_evaluations(self.folder):
-            returns.setdefault(each.step, []).append(each.episode_return)
-        rows = [(f"{step:,}", interval_of(own), str(len(own))) for step, own in returns.items()]
-        header = ("steps", "return: median [10 %, 90 %]", "episodes")
-        return html(repr(self), Table("", header, rows))
-
 
 class Judged(NamedTuple):
     """What is known of encoders.
@@ -119,11 +108,6 @@ class Judged(NamedTuple):
         from jbrep.text import terminal_width
 
         return evaluation_text(self.evaluation, terminal_width())
-
-    def _repr_html_(self) -> str:
-        from jbrep.reporting.evaluation import evaluation_html
-
-        return evaluation_html(self.evaluation)
 
 
 def collect(

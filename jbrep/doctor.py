@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,20 +15,6 @@ from packaging.requirements import Requirement
 
 from jbrep.machine import cores, memory
 
-EXTRAS = {  # what each extra is for; the empty name stands for the core
-    "": "the robot and its environments, collect, data",
-    "dm-control": "jbrep.jitterbug.load, which gives dm_control environments",
-    "learn": "train-dae, train-encoder, evaluate, rl, study, report",
-    "cluster": "collect and study --backend ray",
-    "render": "render",
-    "export": "data import and export, encoder import and export",
-    "logs": "data import of robots' logs: CSV, ROS bags, LeRobot data sets",
-    "suite": "--task dm_control/...",
-    "tune": "tune",
-    "view": "inspect",
-    "wandb": "rl --wandb",
-    "dev": "make check, test and bench",
-}
 _DISTRIBUTIONS = {  # that are called otherwise than the module they bring
     "PIL": "pillow",
     "rerun": "rerun-sdk",
@@ -66,8 +52,8 @@ def examine() -> Iterator[Finding]:
     yield Finding("OpenGL", _opengl())
     address = os.environ.get("RAY_ADDRESS")
     yield Finding("Ray", address or "no RAY_ADDRESS: study --backend ray starts one of its own")
-    for extra, purpose in EXTRAS.items():
-        yield _packages(extra, purpose)
+    for extra in ("", *extras()):
+        yield _packages(extra)
 
 
 def _gpu() -> str:
@@ -91,7 +77,7 @@ def _opengl() -> str:
     return reason.partition("InputError: ")[2] or f"rendering fails: {reason}"
 
 
-def _packages(extra: str, purpose: str) -> Finding:
+def _packages(extra: str) -> Finding:
     """Whether all requirements of an extra are installed, in versions that fit."""
     name, asked = extra or "core", [(each, _installed(each)) for each in _required(extra)]
     wrong = [
@@ -101,10 +87,10 @@ def _packages(extra: str, purpose: str) -> Finding:
     ]
     missing = [r.name for r, v in asked if not v]
     if not wrong and not missing:
-        return Finding(name, f"{purpose}: {', '.join(f'{r.name} {v}' for r, v in asked)}")
+        return Finding(name, ", ".join(f"{r.name} {v}" for r, v in asked))
     problems = [*wrong, *([f"no {', '.join(missing)}"] if missing else [])]
     package = f"jbrep[{extra}]" if extra else "jbrep"
-    said = f"{', '.join(problems)}, for {purpose}: pip install '{package}'"
+    said = f"{', '.join(problems)}: pip install '{package}'"
     return Finding(name, said, is_wrong=bool(wrong) or not extra)
 
 
@@ -114,6 +100,11 @@ def _installed(requirement: Requirement) -> str:
         return version(requirement.name)
     except PackageNotFoundError:
         return ""
+
+
+def extras() -> list[str]:
+    """The names of jbrep's extras."""
+    return metadata("jbrep").get_all("Provides-Extra") or []
 
 
 def _required(extra: str) -> Iterator[Requirement]:
@@ -126,5 +117,4 @@ def _required(extra: str) -> Iterator[Requirement]:
 def extra_with(module: str) -> str | None:
     """The first extra that brings a module, for what to install; None if no extra does."""
     name = _DISTRIBUTIONS.get(module, module.replace("_", "-"))
-    extras = (extra for extra in EXTRAS if extra)
-    return next((e for e in extras if name in (r.name for r in _required(e))), None)
+    return next((e for e in extras() if name in (r.name for r in _required(e))), None)

@@ -7,13 +7,11 @@ import sys
 import textwrap
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from html import escape
-from itertools import chain, count, pairwise
+from itertools import chain, count
 from typing import NamedTuple, TypeVar
 
 SIGNIFICANT = ",.3g"  # a format for `number`: three digits
 _GAP = "  "  # between columns
-_BLOCKS = "▁▂▃▄▅▆▇█"
 _NUMBER = re.compile(r"[<>]? ?-?[\d,]*\.?\d+(e[-+]?\d+)?( \[.*\]| \(\d+/\d+\))?")
 _COLUMN = re.compile(r"(step|action|reward)(_\d+)?")
 _NO_NUMBER = re.compile(r"-( \(\d+/\d+\))?")
@@ -53,31 +51,6 @@ class Table(NamedTuple):
         cells = table(self.header, self.rows, width)
         return f"{wrapped(self.title, width)}\n\n{cells}" if self.title else cells
 
-    def html(self) -> str:
-        """The title and the table for a notebook."""
-        aligned = ["right" if numeric else "left" for numeric in self.numeric]
-        lines = [("th", self.header), *(("td", row) for row in self.rows)]
-        rows = "".join(
-            "<tr>"
-            + "".join(
-                f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>'
-                for side, cell in zip(aligned, cells, strict=True)
-            )
-            + "</tr>"
-            for tag, cells in lines
-        )
-        return f"<table><caption>{escape(self.title)}</caption>{rows}</table>"
-
-
-def html(*parts: "str | Table") -> str:
-    """Texts and tables for a notebook, one below the other; lines of a text stay as they are."""
-    return "".join(
-        each.html()
-        if isinstance(each, Table)
-        else f"<p style='white-space:pre-wrap'>{escape(each)}</p>"
-        for each in parts
-    )
-
 
 def wrapped(text: str, width: int | None) -> str:
     """Text in lines of at most that width; None leaves it on one line."""
@@ -89,21 +62,6 @@ def wrapped(text: str, width: int | None) -> str:
 def terminal_width() -> int:
     """COLUMNS if it is set, else the width of the terminal in characters; without one 80."""
     return shutil.get_terminal_size().columns
-
-
-def sparkline(values: Sequence[float], width: int) -> str:
-    """A curve of numbers in one line: a block for each, from the least to the largest.
-
-    Of more numbers than fit the width, each block shows the mean of its share. Those that aren't
-    finite are left out.
-    """
-    values = [value for value in values if math.isfinite(value)]
-    length = min(len(values), width)
-    ends = [len(values) * i // length for i in range(length + 1)] if length else []
-    means = [sum(values[a:b]) / (b - a) for a, b in pairwise(ends)]
-    least, most = min(means, default=0.0), max(means, default=0.0)
-    steps = (len(_BLOCKS) - 1) / (most - least) if most > least else 0.0
-    return "".join(_BLOCKS[round((each - least) * steps)] for each in means)
 
 
 def rounded(*values: float) -> list[str]:

@@ -28,14 +28,12 @@ def home(tmp_path_factory):
 
 def test_from_states_to_a_policy(home):
     data = jbrep.Dataset(home / "data")
-    assert ">position_x</td>" in data._repr_html_()
     encoder = jbrep.train_encoder(home / "data", home / "encoders", "pca", latent=4)
     assert (encoder.name, encoder.latent_size) == ("pca-4", 4)
     agent = jbrep.train(data.task, home / "run", algorithm="a2c", encoder=encoder, **QUICK)
     assert agent.returns.shape == (3,)
     assert repr(agent).startswith("Agent(a2c-modern on pca-4, face_direction: ")
     assert repr(agent).endswith(f"median [10 %, 90 %] of 3 episodes; '{home}/run')")
-    assert "<td" in agent._repr_html_()
     policy = jbrep.load_policy(home / "run")
     row = data["observation"][0]
     np.testing.assert_array_equal(policy(row), agent.policy(row))
@@ -77,7 +75,6 @@ def test_encoders_are_judged_by_names_and_as_a_dictionary(home):
     by_name = jbrep.evaluate([path, lambda rows: rows[:, :2]], home / "data")
     assert [*by_name.encoders] == ["full", "pca-4", "function"]
     assert "\npca-4        4 " in repr(by_name)
-    assert ">pca-4</td>" in by_name._repr_html_()
     named = jbrep.evaluate({"mine": path}, jbrep.Dataset(home / "data"), home / "evaluation")
     assert (home / "evaluation/evaluation.json").exists()
     assert named.encoders["mine"].reconstruction == by_name.encoders["pca-4"].reconstruction
@@ -99,7 +96,6 @@ def test_a_study_without_a_file(home):
     assert {row.seed for row in found.returns} == {0, 1}
     assert found.page.exists()
     assert "Pendulum-v1" in repr(found)
-    assert "<img " in found._repr_html_()
     again = jbrep.report(home / "study", out=home / "elsewhere")
     assert again.page == home / "elsewhere/report.html"
     assert again.returns == found.returns

@@ -16,7 +16,7 @@ from jbrep.collecting import collect
 from jbrep.studies import runner
 from jbrep.studies.plan import Plan
 from jbrep.studies.runner import work
-from jbrep.studies.tables import read_curves
+from jbrep.studies.tables import read_tables, write_tables
 
 DATA = some(steps=12_000, shard_episodes=50)
 STUDY = TINY.replace(seeds=(0,), steps=1000, evaluate_every=1000)
@@ -37,8 +37,10 @@ def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
     assert contents(tmp_path / "data") == contents(tmp_path / "data-here")
     plan = Plan(STUDY, tmp_path / "study-here")
     assert {work(plan.assigned(cell)).status for cell in plan.cells} == {"finished"}
-    pairs = zip(read_curves(tmp_path / "study"), read_curves(plan.folder), strict=True)
-    for ours, theirs in pairs:
+    folders = (tmp_path / "study", plan.folder)
+    for folder in folders:
+        write_tables(folder)
+    for ours, theirs in zip(*(read_tables(each).curves() for each in folders), strict=True):
         assert (ours.label, ours.settings) == (theirs.label, theirs.settings)
         np.testing.assert_array_equal(ours.returns, theirs.returns)
 

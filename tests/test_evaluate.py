@@ -29,7 +29,6 @@ from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.controls import Random
 from jbrep.methods.linear import principal_code
 from jbrep.records.document import read_document
-from jbrep.reporting import figures
 from jbrep.reporting.evaluation import evaluation_text
 from jbrep.stats.bootstrap import bootstrap
 
@@ -330,7 +329,6 @@ def test_an_evaluation_is_one_file_and_repeats(data, tmp_path):
 
 def test_the_command_says_which_encoders_were_taken(collected, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(figures, "encoder_plots", lambda evaluation: [])  # they take seconds
     monkeypatch.setattr("jbrep.evaluation.regression._STEPS", 20)
     save(find("pca-4", "face_direction").with_header(name="dae-4"), Path("dae-4"))
     chosen = ("--encoder", "dae-4", "./dae-4")

@@ -6,7 +6,6 @@ import runpy
 import socket
 import struct
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
@@ -137,22 +136,6 @@ def test_an_angle_with_and_without_its_jump(monkeypatch):
         codes = encoder(sides)
         assert codes.shape == (2, size)
         assert float((codes[0] - codes[1]).abs().max()) == pytest.approx(apart, abs=0.01)
-
-
-def test_a_late_answer_does_not_stay_late(monkeypatch):
-    """A robot takes the newest of the answers that have come."""
-    monkeypatch.syspath_prepend(ROBOT)
-    newest = import_module("robot")._newest
-    robot, controller = socket.socketpair(type=socket.SOCK_DGRAM)
-    with robot, controller:
-        for step in (0, 1, 2):
-            controller.send(struct.pack("<If", step, step / 10))
-        action, is_late = newest(robot, 2, time.monotonic() + 5, np.zeros(1, np.float32))
-        assert (action.tolist(), is_late) == ([np.float32(0.2)], False)
-        assert newest(robot, 3, time.monotonic(), action) == (action, True)
-        controller.send(struct.pack("<If", 3, 0.3))
-        action, is_late = newest(robot, 4, time.monotonic() + 0.05, action)
-        assert (action.tolist(), is_late) == ([np.float32(0.3)], True)
 
 
 def test_behaviour_of_policies_is_tabled_and_drawn(tmp_path, monkeypatch, capsys):

@@ -2,18 +2,15 @@
 
 import csv
 import io
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from judged import NOTHING, diagnostics, evaluation
+from judged import NOTHING
 from made_up import drawn, found_of
 from PIL import Image
 
-from jbrep.evaluation.evaluation import FeatureError, Prediction, Reconstruction, Score
-from jbrep.reporting.figures import encoder_plots, study_plots, write
+from jbrep.reporting.figures import study_plots, write
 from jbrep.reporting.figures.panels import COLUMN, PAGE, PAPER, fitting
-from jbrep.reporting.findings import Verdict
 from jbrep.stats import RunCurve, analyse
 
 STEPS = np.arange(0, 50_001, 10_000)
@@ -120,60 +117,6 @@ def of_runs(some, played=IN_TRAINING):
     return found_of(analyse(some), some, played)
 
 
-def of_first_group(name):
-    key = (*GROUPS[0], name)
-    return [run for run in runs() if (run.task, run.algorithm, run.representation) == key]
-
-
-def test_every_run_is_drawn(plots, found):
-    (axes, *_) = drawn(plots["every_run"]).axes
-    assert len([line for line in axes.lines if len(line.get_xdata()) == len(STEPS)]) == 4
-    key = {"task": GROUPS[0][0], "algorithm": GROUPS[0][1], "representation": "full", "seed": 0}
-    (run,) = [r for r in found.runs if (r.label, r.seed) == ("face_direction/ddpg/full", 0)]
-    assert values(plots["every_run"], "mean_return", **key) == [mean for _, mean in run.curve]
-
-
-def test_a_point_for_each_run_and_an_interval_for_each_representation(plots, found):
-    agents = found.groups[0].agents
-    axes = drawn(plots["final_return"]).axes[0]
-    points = [drawn for drawn in axes.lines if drawn.get_marker() == "."]
-    for dots, each in zip(points, agents, strict=True):
-        np.testing.assert_array_equal(dots.get_ydata(), each.by_run["final_return"])
-    bars = [bar for bar in axes.lines if len(bar.get_ydata()) == 2 and 0.1 < bar.get_xdata()[1] < 9]
-    bars = [bar for bar in bars if bar.get_xdata()[0] == bar.get_xdata()[1]]
-    for bar, each in zip(bars, agents, strict=True):
-        np.testing.assert_allclose(bar.get_ydata(), each.numbers["final_return_mean"][1:])
-
-
-def with_numbers(found, where, name, score):
-    """The first group alone, in which one number is another."""
-    group = found.groups[0]
-    first, *others = getattr(group, where)
-    changed = first.replace(numbers={**first.numbers, name: Score(*score)})
-    return found.replace(groups=[group.replace(**{where: [changed, *others]})])
-
-
-def cut_marks(axes, markers):
-    return [
-        (line.get_xdata()[0], line.get_ydata()[0], line.get_marker())
-        for line in axes.lines
-        if line.get_marker() in markers and not line.get_clip_on()
-    ]
-
-
-def test_no_interval_stretches_an_axis_and_cuts_are_marked(found):
-    final, *_ = study_plots(with_numbers(found, "agents", "final_return_sd", (40, 2, 5000)))
-    axes = drawn(final).axes[1]
-    largest = max(each.numbers["final_return_sd"].value for each in found.groups[0].agents)
-    assert axes.get_ylim()[1] < 4 * largest < 5000
-    assert (0.16, axes.get_ylim()[1], "^") in cut_marks(axes, "v^")
-    far = with_numbers(found, "agents", "final_return_mean", (500, -9000, 9000))
-    axes = drawn(study_plots(far)[0]).axes[0]
-    low, high = axes.get_ylim()
-    assert -600 < low < high < 1600
-    assert cut_marks(axes, "v^")[:2] == [(0.16, low, "v"), (0.16, high, "^")]
-
-
 def difference_panel(found):
     (plot,) = [plot for plot in study_plots(found) if plot.name == "differences"]
     return drawn(plot).axes[0], plot.rows
@@ -190,27 +133,6 @@ def test_differences_from_the_baseline_stand_with_their_intervals(found):
     assert texts == ["dae-8 - full", "pca-4 - full"]
 
 
-def test_claims_stand_in_their_place_with_boundaries_and_what_was_tested(found):
-    verdict = Verdict(
-        **{"task": "face_direction", "algorithm": "ddpg", "x": "dae-8", "y": "pca-4"},
-        **{"claim": "not worse", "verdict": "supported", "boundary": -90.0, "width": 700.0},
-        **{"p": 0.01, "level": 0.05, "runs": 4, "units": 4, "by_encoder": False},
-        **{"by": None, "reason": None},
-        estimate=Score(200.0, 150.0, 250.0),
-        interval=Score(200.0, 145.0, 255.0),
-    )
-    faster = verdict.replace(claim="faster", estimate=Score(-1e4, -2e4, 0.0))
-    axes, rows = difference_panel(found.replace(verdicts=[verdict, faster]))
-    bars = {
-        line.get_linewidth(): [*line.get_xdata()]
-        for line in axes.lines
-        if len(line.get_xdata()) == 2
-    }
-    assert (bars[0.8], bars[2], bars[0.9]) == ([145, 255], [150, 250], [-90, -90])
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["dae-8 not worse than pca-4"]
-    assert rows[0]["representation"] == "dae-8"
-
-
 def test_limits_hold_what_is_near_and_not_what_is_far():
     returns = [-400.0, -100.0, np.nan]
     assert fitting(returns) == pytest.approx((-412, -88))
@@ -221,48 +143,11 @@ def test_limits_hold_what_is_near_and_not_what_is_far():
     assert fitting([0.2, 0.2]) == pytest.approx((-0.3, 0.7))
 
 
-def test_a_profile_falls_from_all_runs_to_none(plots, found):
-    for group in found.groups:
-        shares = [share.value for share in group.agents[0].profile]
-        assert (shares[0], shares[-1]) == (1, 0)
-        assert np.all(np.diff(shares) <= 0)
-        key = {"task": group.task, "algorithm": group.algorithm, "representation": "full"}
-        assert values(plots["profiles"], "value", **key) == shares
-    assert {row["task"] for row in plots["profiles"].rows if row["number"] == "score"} == {
-        "2 tasks"
-    }
-
-
 def test_without_statistics_the_runs_are_drawn_all_the_same(found):
     assert [plot.name for plot in study_plots(found.replace(groups=[], aggregates=[]))] == [
         "every_run"
     ]
     assert study_plots(found.replace(groups=[], aggregates=[], runs=[])) == []
-
-
-def test_names_and_policies_with_dollar_signs_are_no_formulas():
-    odd = [replace(run, representation="$x^{") for run in of_first_group("full")]
-    for plot in study_plots(
-        of_runs([*of_first_group("full"), *odd], {"face_direction": {"$y^{": 300.0}})
-    ):
-        drawn(plot).canvas.draw()
-
-
-def test_of_a_wide_robot_the_worst_features_are_shown():
-    """Humanoid's 348 would make a figure of 14,000 pixels, with names that nobody can read."""
-    r2 = [*(Score(1 - i / 348, None, None) for i in range(347)), NOTHING]  # the last is constant
-    features = [
-        FeatureError(name=f"obs_{i}", unit="", mse=NOTHING, rmse_physical=NOTHING, r2=each)
-        for i, each in enumerate(r2)
-    ]
-    lost = Reconstruction(mse=NOTHING, pca_mse=NOTHING, ratio_to_pca=None, features=features)
-    encoders = {"mine": diagnostics(348, kind="dae", reconstruction=lost)}
-    (by_feature,) = encoder_plots(evaluation(encoders, "Humanoid-v5"))
-    assert len(by_feature.rows) == 348
-    figure = drawn(by_feature)
-    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert names == [f"obs_{i}" for i in range(307, 347)]
-    assert figure.get_figheight() < 8
 
 
 def test_diagnostics_stand_against_final_returns(found):
@@ -282,27 +167,3 @@ def test_diagnostics_stand_against_final_returns(found):
     mine, error = drawn(plot).axes
     assert mine.lines[1].get_xydata().tolist() == [[0.5, 500.0]]
     assert error.get_xlim()[0] > error.get_xlim()[1]
-
-
-def scores(quality):
-    """How well an encoder predicts, by the steps ahead."""
-    three = Score(quality, quality - 0.02, quality + 0.02)
-    known = {"features": {"yaw": three, "still": NOTHING}, "mean": three}
-    reward = Score(quality / 2, None, None)
-    return {steps: Prediction(**known, reward=reward, rewarded=None) for steps in ("1", "5", "20")}
-
-
-def test_predictions_stand_by_feature_and_encoder():
-    encoders = {
-        name: diagnostics(2, kind=name, prediction=scores(quality))
-        for name, quality in (("full", 0.9), ("slow-2", 0.8), ("slow-1", 0.1))
-    }
-    plot, by_horizon = encoder_plots(evaluation(encoders))
-    assert "5 steps" in plot.caption  # there are none of 10
-    assert values(by_horizon, "r2", encoder="slow-2", steps=20) == [0.8, 0.4]
-    axes = drawn(plot).axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == [
-        *("yaw", "still", "mean of features", "reward")
-    ]
-    expected = [[0.9, 0.8, 0.1], [np.nan] * 3, [0.9, 0.8, 0.1], [0.45, 0.4, 0.05]]
-    np.testing.assert_array_equal(axes.images[0].get_array(), expected)

@@ -30,7 +30,6 @@ from jbrep.evaluation import diagnose
 from jbrep.inspection import inspect
 from jbrep.jitterbug import JitterbugEnv
 from jbrep.reporting.evaluation import evaluation_text
-from jbrep.reporting.figures import encoder_plots
 from jbrep.rl import Run, Session, train
 from jbrep.rl.files import CHECKPOINT, ENCODER, RUN
 from jbrep.rl.policy import load_run
@@ -252,13 +251,6 @@ def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
     assert (own["module"].kind, own["module"].latent) == ("own", 6)
     shown = evaluation_text(evaluation, everything=True)
     assert re.search(r"^half .* +- +-$", shown, re.MULTILINE)  # no error, in no unit
-    plots = {plot.name: plot for plot in encoder_plots(evaluation)}
-    assert {row["encoder"] for row in plots["error_by_feature"].rows} == {"whole"}
-    for plot in plots.values():
-        assert plot.figure
-    alone = evaluation.replace(encoders={n: own[n] for n in ("full", "half")})
-    names = ["prediction_by_feature", "prediction_by_horizon"]
-    assert [plot.name for plot in encoder_plots(alone)] == names
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,6 @@ from jbrep.envs.description import with_domain
 from jbrep.envs.domain import Domain, Draws, read_ranges
 from jbrep.envs.physics import put_factors, velocity_after
 from jbrep.envs.view import with_view
-from jbrep.play.jitterbug import turn_targets
 from jbrep.play.perturbed import domains_of
 from jbrep.play.sources import find_player
 from jbrep.rl import Run, Session, StoppedError, train
@@ -349,5 +348,3 @@ def test_what_can_not_be_with_a_domain():
     task = with_domain(TASKS["face_direction"], {"delay": 1})
     said = refused(lambda: DataSettings(task=task, steps=10))
     assert said.startswith("face_direction draws its delay=1 in each episode: data sets are of")
-    with Lanes(task, 1, 1) as lanes:
-        assert "in which no target is turned" in refused(turn_targets, lanes, 0.0)

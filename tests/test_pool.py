@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -65,30 +64,12 @@ def never_stop(folder):
     time.sleep(600)
 
 
-def sleep_after(seconds):
-    time.sleep(seconds)
-    return seconds, os.getpid()
-
-
 def test_jobs_come_back_with_their_results():
     results = dict(begun(square, range(5), 2))
     assert {job: number for job, (number, _) in results.items()} == {n: n**2 for n in range(5)}
     workers = {process for _, process in results.values()}
     assert len(workers) <= 2  # used again
     assert not workers_of(os.getpid())
-
-
-def test_jobs_are_taken_as_processes_become_free():
-    jobs, taken = iter([3.0, 0.0, 0.1]), []
-
-    def next_job():
-        taken.append(next(jobs, None))
-        return taken[-1]
-
-    with closing(side_by_side(sleep_after, next_job, 2)) as results:
-        assert next(results)[0] == 0.0
-        assert taken == [3.0, 0.0]
-        assert next(results)[0] == 0.1
 
 
 def test_the_job_of_a_dead_worker_is_tried_again(tmp_path):

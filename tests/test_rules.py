@@ -236,12 +236,6 @@ def test_claims_may_be_of_any_two_representations():
     assert levels == pytest.approx([0.05 / 3, 0.05 / 3, 0.05])  # what the others no longer need
 
 
-def test_fewer_than_eight_runs_decide_nothing():
-    found = verdicts(FULL[:7], BETTER[:7])
-    assert words(found) == ["undecided"] * 3
-    assert found[0].reason == "7 runs; verdicts take 8"
-
-
 def test_what_may_fail_unseen_must_not_change_a_verdict():
     """Of ten runs that all learn, a quarter may fail, which no interval shows."""
     assert most_failing(0, 10, 0.05) == pytest.approx(1 - 0.05 ** (1 / 10))
@@ -390,12 +384,6 @@ def test_where_runs_are_cut_returns_are_held_to_what_those_starts_return():
     assert (group.ends.blind, group.blind.value) == (250, 250)
 
 
-def test_agents_that_stay_as_they_were_do_not_learn_by_beginning_elsewhere():
-    nothing = {"return_floor": None, "reference": None, "final": np.full(20, 700.0)}
-    (group,) = analyse([curve(250, seed=seed, **nothing) for seed in range(5)]).groups
-    assert group.labels[0].learnt == "no"
-
-
 def test_a_failed_run_is_as_bad_as_the_worst_start_of_all():
     bad, good = arm("full", drawn(-900, 20, 2, 0), return_floor=None)
     runs = [replace(bad, final=np.full(20, -5000.0)), good]
@@ -430,14 +418,6 @@ def test_there_is_no_verdict_where_it_is_not_known_what_gains_count_over():
     assert words(planned(groups)) == ["contradicted"]
     (found,) = replace(planned, prevented={"face_direction": "nobody stood still"})(groups)
     assert (found.verdict, found.reason) == ("undecided", "nobody stood still")
-
-
-def test_curves_that_do_not_differ_at_all_have_no_spread():
-    x, y = np.full((8, 5), 3.0), np.random.default_rng(0).normal(0, 9, (8, 5))
-    how = (np.full(5, 0.2), 1e-3)
-    assert ratio_of_spreads(Curves(x, y, *how), 0.95, 0) == (0, 0, 0)
-    assert ratio_of_spreads(Curves(y, x, *how), 0.95, 0)[::2] == (np.inf, np.inf)
-    assert np.isnan(ratio_of_spreads(Curves(x, x, *how), 0.95, 0)).all()
 
 
 @pytest.mark.parametrize(("offset", "deviation"), [(-1000, 0.1), (0, 1)])

@@ -1,6 +1,5 @@
 """Settings other than a preset's: their names and values, networks, and running normalisation."""
 
-import hashlib
 import json
 import shutil
 import tomllib
@@ -9,26 +8,22 @@ import numpy as np
 import pytest
 import torch
 from command import jbrep, mistake
-from small import assert_same_files, forge
-from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import VecNormalize
+from small import assert_same_files
 
 from jbrep.encoders import find
 from jbrep.envs import describe
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import episode_returns
-from jbrep.errors import DamageError, InputError
-from jbrep.records import container
+from jbrep.errors import InputError
 from jbrep.reporting.tables import read_tables
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.agent import evaluate, make_agent, make_env, statistics_of
-from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, RUN, read_evaluations, read_run
+from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, read_evaluations, read_run
 from jbrep.rl.learner import Learner, preset_text, read_preset, usual_name
-from jbrep.rl.overrides import overridden, setting_names
+from jbrep.rl.overrides import overridden
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_zip import load_zip
 from jbrep.rl.presets import sb3_class
-from jbrep.rl.settings import CLASSES
 from jbrep.studies.config import as_study, read_study
 from jbrep.studies.plan import Plan, read_plan
 from jbrep.studies.tables import write_tables
@@ -45,17 +40,6 @@ QUICK = {
     "final_episodes": 2,
 }
 SAC_RUN = Run.of(**QUICK, overrides={**SMALL, "normalize": True})
-
-
-def edited(folder, to, **hyperparameters):
-    """A copy of a run with other settings in run.json, of the learner or of hyperparameters."""
-    shutil.copytree(folder, to)
-    run = json.loads((to / RUN).read_text())
-    for name, value in hyperparameters.items():
-        part = run["settings"] if name in run["settings"] else run["settings"]["hyperparameters"]
-        part[name] = value
-    forge(to / RUN, run)
-    return to
 
 
 def agent_of(algorithm, overrides, preset="modern"):
@@ -117,24 +101,6 @@ def test_what_a_setting_can_not_be(algorithm, settings, named, tmp_path):
         train(Run.of(**QUICK, algorithm=algorithm, overrides=settings), tmp_path / "run")
     assert "\n" not in str(error.value)
     assert not (tmp_path / "run").exists()
-
-
-def test_every_setting_of_every_algorithm_takes_stable_baselines3_s_own_value():
-    for algorithm in CLASSES:
-        kind = sb3_class(algorithm)
-        agent = agent_of(algorithm, {})
-        names = {*setting_names(algorithm)} & {*vars(agent)} - {
-            "noise",
-            "action_repeat",
-            "target_entropy",
-        }
-        plain = {
-            name: value
-            for name in names
-            if isinstance(value := getattr(kind("MlpPolicy", agent.env), name), (int, float, str))
-        }
-        assert {"gamma", "learning_rate"} <= {*plain}
-        overridden(algorithm, "modern", plain)
 
 
 def test_the_command_line_sets_them(tmp_path):
@@ -267,21 +233,6 @@ def test_normalisation_is_resumed_evaluated_and_read_back(run, tmp_path):
     np.testing.assert_array_equal(*acts)
 
 
-def test_statistics_are_those_of_what_the_agent_saw(run):
-    """stable-baselines3's own environment, with the same statistics, gives the same view."""
-    agent = SAC.load(run / POLICY_ZIP, device="cpu")
-    statistics = load_run(run).statistics
-    env = make_env(TASK, 1, 0, find("full", TASK), normalize=True)
-    assert isinstance(env, VecNormalize)
-    statistics.give(env)
-    seen = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
-    np.testing.assert_array_equal(statistics(seen), env.normalize_obs(seen))
-    assert np.all(statistics.mean != 0)
-    assert agent.policy.state_dict()["actor.mu.bias"].equal(
-        load_run(run).policy.state_dict()["actor.mu.bias"]
-    )
-
-
 def test_gradient_steps_and_evaluations_use_the_statistics_without_changing_them():
     agent = agent_of("sac", {**SMALL, "normalize": True})
     assert agent._vec_normalize_env is agent.env
@@ -312,40 +263,6 @@ def test_a_run_that_begins_with_another_takes_its_statistics_along(run, tmp_path
         other = Run.of(**QUICK, overrides=settings, begin_from=str(run))
         with pytest.raises(InputError, match=message):
             train(other, tmp_path / "other")
-
-
-def test_a_folder_from_elsewhere_holds_no_other_settings_or_statistics(run, tmp_path):
-    for i, (settings, message) in enumerate(
-        (
-            ({"net_arch": [10**9]}, "net_arch.* must be"),
-            ({"policy_kwargs": {"features_extractor_class": "os.system"}}, "has no argument"),
-            ({"policy_kwargs": {"activation_fn": "os.system"}}, "activation_fn is 'os.system'"),
-            ({"policy_kwargs": {}}, "no policy can be made"),
-            ({"policy_kwargs": {"activation_fn": "relu", "n_critics": 10**9}}, "n_critics is"),
-            ({"algorithm_kwargs": {"use_sde": True}}, "doesn't fit the run's settings"),
-        )
-    ):
-        with pytest.raises(InputError, match=message) as error:
-            load_run(edited(run, tmp_path / str(i), **settings))
-        assert "\n" not in str(error.value)
-
-
-def test_damaged_statistics_are_named(run, tmp_path):
-    folder = shutil.copytree(run, tmp_path / "copy")
-    sound, header = container.read(run / POLICY, "policy")
-    for changes in (
-        {"statistics.mean": None},
-        {"statistics.mean": np.full(3, np.nan)},
-        {"statistics.variance": -np.ones(3)},
-        {"statistics.mean": np.zeros(2)},
-    ):
-        tensors = {n: each for n, each in {**sound, **changes}.items() if each is not None}
-        container.write(folder / POLICY, tensors, header)
-        written = json.loads((folder / RUN).read_text())
-        written["policy_sha256"] = hashlib.sha256((folder / POLICY).read_bytes()).hexdigest()
-        forge(folder / RUN, written)
-        with pytest.raises(DamageError, match=r"policy\S+ is damaged: the (mean|variance)"):
-            load_run(folder)
 
 
 STUDY = """

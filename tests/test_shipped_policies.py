@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 from command import jbrep, mistake
 
@@ -16,14 +15,10 @@ SHIPS = shipped()
 
 def test_each_file_that_ships_is_listed_with_what_it_returns():
     assert {policy.task for policy in SHIPS} == {path.stem for path in FOLDER.glob("*.safetensors")}
-    told = json.loads(jbrep("policies", "--json").output)
-    for policy in SHIPS:
-        known = told[policy.task]
-        for name, returns in policy.returns.items():
-            assert known[name]["median"] == pytest.approx(np.median(returns))
-        assert known["episodes"] == len(policy.returns[SHIPPED]) == 100
     lines = jbrep("policies").output.splitlines()
-    assert [line.split()[0] for line in lines[1 : len(SHIPS) + 1]] == [*told]
+    assert [line.split()[0] for line in lines[1 : len(SHIPS) + 1]] == [
+        policy.task for policy in SHIPS
+    ]
     assert lines[-1].startswith("falling: the preset wide, but with")  # in a learner's name
 
 

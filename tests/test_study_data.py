@@ -5,7 +5,7 @@ import signal
 import tomllib
 
 import pytest
-from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
+from command import start, wait_for, wait_for_the_end_of, workers_of
 from test_study import TINY
 
 from jbrep.collecting.policies import acts_on_observations
@@ -16,7 +16,6 @@ from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.rl.policy_file import shipped_file
 from jbrep.studies.config import Data, as_study
-from jbrep.studies.forecast import made_first
 from jbrep.studies.plan import Plan
 from jbrep.studies.prepare import check, prepare
 
@@ -80,20 +79,6 @@ def test_data_hold_what_the_mixture_says(made):
         assert (folder / "policy-0.safetensors").read_bytes() == shipped_file(task).read_bytes()
         dataset = Dataset(folder)
         assert (len(dataset["action"]), dataset.task.name) == (600, task)
-
-
-def test_only_what_does_not_look_is_derived(made):
-    stored = {
-        (name, task): read_manifest(made.data(task, 0, name)).settings.store_state
-        for name in DATA
-        for task in STUDY.tasks
-    }
-    assert stored == {
-        ("apart", TASK): True,
-        ("apart", "move_in_direction"): False,
-        ("mixed", TASK): True,
-        ("mixed", "move_in_direction"): True,
-    }
 
 
 def test_two_workers_make_the_same_bytes(made, tmp_path, capfd):
@@ -221,28 +206,3 @@ def test_named_data_may_come_later_but_not_change(made):
     other = {**DATA, "mixed": Data(steps=601, policy=MIXTURE, seed=40)}
     with pytest.raises(InputError, match=r"another study: data\.mixed"):
         Plan(STUDY.replace(data=other), made.folder).check_folder()
-
-
-def test_what_is_made_first_is_counted(made, tmp_path):
-    there = {each.what: each[1:] for each in made_first(made)}
-    assert there == {
-        **{"data.apart": (0, 2), "data.mixed": (0, 4)},
-        **{"full": (0, 2), "pca-4": (0, 2), "late": (0, 4)},
-    }
-    codes = ("full", {"name": "dae-2", "encoders": 2})
-    study = TINY.replace(representations=codes, data={"": Data(steps=200_000, policy=MIXTURE)})
-    none = Plan(study, tmp_path / "none")
-    assert [*made_first(none)] == [("data", 2, 0), ("full", 1, 0), ("dae-2", 2, 0)]
-    assert not none.folder.exists()
-
-
-def test_a_dry_run_shows_what_is_made_first(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.studies.forecast.estimate", lambda run: 60)
-    study = TINY.replace(data={"": Data(steps=300)})
-    (tmp_path / "it.toml").write_text(study.toml())
-    told = jbrep("study", tmp_path / "it.toml", "--out", tmp_path / "out", "--dry-run")
-    assert told.exit_code == 0, told.output
-    rows = [line.split()[:3] for line in told.stdout.splitlines()]
-    for row in (["data", "1", "0"], ["full", "1", "0"], ["pca-8", "1", "0"]):
-        assert row in rows
-    assert not (tmp_path / "out").exists()

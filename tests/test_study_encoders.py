@@ -5,7 +5,6 @@ import shutil
 import tomllib
 from pathlib import Path
 
-import numpy as np
 import onnx
 import pytest
 from command import in_this_process, jbrep
@@ -14,9 +13,7 @@ from my_encoders import LATENT, SIZE, FirstFeatures, dense
 from small import forge
 from test_convert import model
 from test_study import TINY as TINY_STUDY
-from test_study import tables_with
 
-from jbrep.dataset import Dataset
 from jbrep.encoders import find, load, save
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
@@ -33,11 +30,10 @@ from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.policy import load_run
 from jbrep.studies.config import Data, as_study
-from jbrep.studies.forecast import forecast
-from jbrep.studies.plan import Assigned, Plan, read_plan
+from jbrep.studies.plan import Plan, read_plan
 from jbrep.studies.prepare import prepare
 from jbrep.studies.record import EACH_ITS_OWN, RECORD
-from jbrep.studies.runner import run_study, work
+from jbrep.studies.runner import run_study
 from jbrep.studies.tables import write_tables
 
 TASK = "face_direction"
@@ -180,13 +176,6 @@ def test_diagnostics_are_matched_by_the_encoders(done, tmp_path):
         add_diagnostics(folder, [str(tmp_path / "later")])
 
 
-def test_an_evaluation_knows_code_by_the_hash_of_its_runs(done):
-    known = {name: find(code, SHARED["task"]).fingerprint for name, code in OWN.items()}
-    for cell in done.cells:
-        if (name := cell.representation.name) in OWN:
-            assert read_run(done.folder_of(cell)).settings.encoder == known[name]
-
-
 def write_evaluation(folder, forward):
     """An evaluation of encoders, by label: their SHA-256, and one number."""
     folder.mkdir()
@@ -208,12 +197,6 @@ def test_a_study_names_evaluations(done, tmp_path):
     (line,) = add_diagnostics(tmp_path)
     assert " of dense, from-onnx, mine (2 of 2 encoders), net: " in line
     assert [row.representation for row in read_diagnostics(tmp_path / DIAGNOSTICS)] == ["full"]
-
-
-def test_different_encoders_under_one_label_are_refused_otherwise(done, tmp_path):
-    results = tables_with(done, tmp_path, "mine/*", encoder_seed=None)
-    assert results.analysis is None
-    assert "mixes the settings" in results.left_out[0]
 
 
 def test_the_report_tells_of_own_encoders(done):
@@ -245,9 +228,6 @@ def test_a_file_that_changes_is_refused_once_its_run_has_ended(done, home):
     ("file", "expected"),
     [
         ("one.safetensors", "one.safetensors"),
-        ({"Hopper-v5": "no.safetensors", TASK: "one.safetensors"}, "one.safetensors"),
-        ("folder", f"folder/{TASK}/mine.safetensors"),
-        ("for-all", "for-all/mine.safetensors"),
         ("{task}/{seed}.safetensors", f"{TASK}/1.safetensors"),
     ],
 )
@@ -257,7 +237,7 @@ def test_where_a_file_is(file, expected, tmp_path, monkeypatch):
     study = with_own({"name": "mine", "file": file}, seeds=(1,))
     run = Plan(study, tmp_path / "it").run(Plan(study, tmp_path / "it").cells[1])
     assert run.encoder == str(tmp_path / expected)
-    assert run.encoder_seed == (1 if "{seed}" in str(file) else None)
+    assert run.encoder_seed == (1 if "{seed}" in file else None)
     run.check()
 
 
@@ -291,52 +271,6 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     assert exploratory.startswith("This study is exploratory")
 
 
-def test_each_encoder_of_several_learns_from_its_own_data(tmp_path):
-    """Of two data sets, the third encoder learns from the first again, with another seed."""
-    tasks = (TASK, "move_in_direction")
-    several = ({"name": "pca-4", "encoders": 2}, {"name": "random-4", "encoders": 3}, "full")
-    study = TINY.replace(
-        tasks=tasks,
-        representations=several,
-        seeds=tuple(range(6)),
-        data={"": Data(steps=400, seed=5, sets=2)},
-    )
-    plan = Plan(study, tmp_path / "it")
-    prepare(plan)
-    for task in tasks:
-        made = {path.stem: load(path).header for path in plan.encoders(task).glob("*.safetensors")}
-        learned = {name: header.data["seed"] for name, header in made.items()}
-        assert learned == {
-            **{"pca-4-s0": 5, "pca-4-s1": 6, "full": 5},
-            **{"random-4-s0": 5, "random-4-s1": 6, "random-4-s2": 5},
-        }
-        assert made["random-4-s2"].training["seed"] == 2
-        runs = [plan.run(cell) for cell in plan.cells if cell.task == task]
-        assert [Path(run.encoder).stem for run in runs[:4]] == [
-            *("pca-4-s0", "random-4-s0", "full", "pca-4-s1")
-        ]
-        first, second = (Dataset(plan.data(task, number)) for number in range(2))
-        assert first.manifest.settings.seed == 5
-        assert not np.array_equal(first["observation"][:], second["observation"][:])
-    assert not (tmp_path / "it" / "data" / TASK / "manifest.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("own", "message"),
-    [
-        ({"name": "a", "kind": "slow", "latent": 4, "keep": ["x"]}, "a can't be trained for face"),
-        ({"name": "b", "kind": "pca", "latent": 17}, "b can't be trained for face_direction: lat"),
-    ],
-)
-def test_settings_of_encoders_are_checked_with_the_data(own, message, tmp_path, collected):
-    study = with_own(own, data={"": Data(folder=str(collected))})
-    with pytest.raises(InputError, match=message):
-        run_study(Plan(study, tmp_path / "it"), None, 1)
-    assert not (tmp_path / "it").exists()
-    with pytest.raises(InputError, match=r"a|b is trained by the study, .* \[data\] is missing"):
-        with_own(own)
-
-
 @pytest.mark.parametrize(
     ("own", "message"),
     [
@@ -344,7 +278,6 @@ def test_settings_of_encoders_are_checked_with_the_data(own, message, tmp_path, 
             {"name": "m", "file": "encoders/{task}/m-{seed}.safetensors"},
             rf"run {TASK}/a2c/m/seed-0 can't start: its encoder .*/{TASK}/m-0.safetensors is miss",
         ),
-        ({"name": "m", "file": {"Hopper-v5": "a"}}, f"representation m has no file for {TASK}"),
         ({"name": "m", "file": "pose.safetensors"}, f"made for move_to_pose, not for {TASK}"),
         ({"name": "m", "code": "other:Net"}, "importing other runs it; .* add --import other"),
         ({"name": "m", "code": "my_encoders:Unseeded"}, "makes another encoder each time"),
@@ -382,25 +315,6 @@ def test_a_mistaken_representation_is_refused(given, field):
     with pytest.raises(InputError, match=field) as error:
         as_study({**to_plain(TINY), "data": {"steps": 9, "sets": 1}, "representations": given})
     assert "\n" not in str(error.value)
-
-
-def test_a_worker_imports_the_modules_it_is_told_to(done, tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.envs.names._imported", [])
-    run = done.run(done.cells[2])
-    assert run.encoder == NET
-    assigned = Assigned("net", run, tmp_path)
-    crashed = work(assigned)
-    assert "add --import my_encoders" in crashed.message
-    ended = work(assigned, modules=["my_encoders"])
-    assert ended.status == "finished"
-
-
-def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "jbrep.studies.forecast.estimate", lambda run: 60 if run.encoder == NET else 30
-    )
-    runs = forecast(Plan(done.study, tmp_path / "it"), 1).runs
-    assert [seconds for _, seconds in runs[:5]] == [30, 30, 60, 30, 30]
 
 
 def test_a_run_on_code(done, tmp_path, monkeypatch):

@@ -1,11 +1,9 @@
 """Tables and facts that fit a terminal; progress on a terminal and in a log."""
 
-import io
 import subprocess
 import sys
 
-from jbrep.progress import Progress
-from jbrep.text import duration, facts, slug, sparkline, table, words
+from jbrep.text import facts, slug, table, words
 
 HEADER = ("encoder", "error", "ratio", "worst feature")
 ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "motor_angle")]
@@ -15,12 +13,6 @@ p._LOG_EVERY = 0.3
 for _ in p.Progress(range(10), desc="steps", unit="step", initial=5, total=15):
     time.sleep(0.05)
 """
-SHORT = """
-import jbrep.progress as p
-with p.Progress(total=3) as bar:
-    bar.update()
-    bar.set_postfix(error=1)
-"""
 
 
 def test_any_names_become_different_words():
@@ -29,12 +21,6 @@ def test_any_names_become_different_words():
         *("t", "theta", "omega", "e", "q_0", "q_1", "x", "obs_0", "a_b", "a_b_2"),
         *("obs", "obs_step", "obs_action_1"),
     ]
-
-
-def test_a_curve_goes_from_the_least_to_the_largest():
-    assert sparkline([3, 10, 6.5, float("inf")], 5) == "▁█▅"
-    assert sparkline([0, 2, 8, 8, 7], 2) == "▁█"  # means of 1 and 7.67
-    assert (sparkline([5, 5], 5), sparkline([], 5)) == ("▁▁", "")
 
 
 def test_a_table_that_is_too_wide_is_cut_into_parts_that_fit_with_every_cell_once():
@@ -54,27 +40,12 @@ def test_facts_are_wrapped_below_themselves():
     assert all(line.startswith(" " * 7) for line in shown[2:])
 
 
-def test_in_a_notebook_progress_is_a_bar(monkeypatch):
-    class Cell(io.StringIO):
-        __module__ = "ipykernel.iostream"
-
-    monkeypatch.setattr(sys, "stderr", Cell())
-    with Progress(total=3) as bar:
-        bar.update(3)
-    assert "\r100%|" in sys.stderr.getvalue()
-
-
 def test_in_a_log_progress_is_a_line_now_and_then():
     done = subprocess.run([sys.executable, "-c", STEPS], capture_output=True, text=True, check=True)
     lines = done.stderr.splitlines()
     assert 1 <= len(lines) < 10
     assert all(line.startswith("steps: ") and " of 15 [" in line for line in lines)
     assert "\r" not in done.stderr
-
-
-def test_short_work_leaves_nothing_in_a_log():
-    done = subprocess.run([sys.executable, "-c", SHORT], capture_output=True, text=True, check=True)
-    assert done.stderr == ""
 
 
 def test_a_closed_standard_error_stops_nothing():
@@ -86,8 +57,3 @@ def test_a_slug_has_hyphens_for_what_a_path_should_not_hold():
     assert slug("dm_control/cheetah-run-v0") == "dm_control-cheetah-run-v0"
     assert slug("my_package:Env-v0 \u00e9\n..") == "my_package-Env-v0---.."
     assert slug("face_direction") == "face_direction"
-
-
-def test_durations_as_text():
-    told = [duration(seconds) for seconds in (12.4, 300, 90 * 60, 1e6)]
-    assert told == ["12 s", "5.0 min", "1.5 h", "277.8 h"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import jbrep
-from made_up import SEEDS, STUDY, found_of, make_runs, of_a_commit
+from made_up import SEEDS, STUDY, make_runs, of_a_commit
 from small import adopt
 
 from jbrep.errors import InputError
@@ -16,7 +16,6 @@ from jbrep.reporting import report
 from jbrep.reporting.findings import Findings
 from jbrep.reporting.report import write_report
 from jbrep.reporting.tables import read_tables
-from jbrep.reporting.views import verdict_cells
 from jbrep.studies.config import as_study
 from jbrep.studies.plan import Plan
 from jbrep.studies.record import RECORD
@@ -82,32 +81,6 @@ def test_the_end_says_what_is_true(reports):
     assert best.tasks == ("face_direction", "move_in_direction")
     scores = [(500 - each.blind) / (each.top - each.blind) for each in ends]
     assert 1 - last.optimality_gap.value == pytest.approx(np.mean(scores), abs=0.03)
-
-
-def first_verdict(reports):
-    return found_of(reports[1][SEEDS][0]).verdicts[0]
-
-
-@pytest.mark.parametrize(
-    ("level", "said"),
-    [
-        (0.05, "95"),
-        (0.05 / 3, "98.33"),
-        (0.0004, "99.96"),
-        (2.5e-6, "99.99975"),
-        (0, "99.9999999999"),
-    ],
-)
-def test_no_level_of_an_interval_is_rounded_to_100_percent(reports, level, said):
-    verdict = first_verdict(reports)
-    assert verdict_cells(verdict.replace(level=level))["level"] == f"{said} %"
-
-
-def test_a_verdict_on_a_rising_curve_says_by_when(reports):
-    rising = first_verdict(reports).replace(by=10_000)
-    assert verdict_cells(rising)["verdict"] == "supported by 10,000 steps"
-    undecided = rising.replace(verdict="undecided")
-    assert verdict_cells(undecided)["verdict"] == "undecided"
 
 
 def test_seeds_that_were_added_are_exploratory(reports):

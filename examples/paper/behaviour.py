@@ -21,8 +21,9 @@ from matplotlib.colors import LogNorm
 from numpy.typing import NDArray
 
 from jbrep.envs import describe
+from jbrep.envs.lanes import Lanes
 from jbrep.envs.task import Task
-from jbrep.play.jitterbug import jitterbug_task
+from jbrep.jitterbug.tasks import jitterbug_task
 from jbrep.play.player import Player
 from jbrep.play.sources import as_player, find_player, is_by_name
 from jbrep.rl.files import FINISHED, is_run, read_run, runs_below
@@ -63,6 +64,15 @@ def find(sources: Sequence[str], task: Task | None) -> dict[str, list[Player]]:
     return found
 
 
+def turn_targets(lanes: Lanes, yaw: float) -> None:
+    """Turn the target of every lane to that yaw [rad], at the start of its episode."""
+    simulation = lanes.envs.simulation
+    turned = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+    targets = {"target_quaternion": np.tile(turned, (lanes.num_lanes, 1))}
+    simulation.restore(**simulation.state | targets)
+    lanes.observation = lanes.envs.look()
+
+
 def watch(players: Sequence[Player], episodes: int, target_yaw: float) -> Visits:
     """What they do in the first so many of the episodes that every run is evaluated on."""
     returns, motor, place = [], [], []
@@ -70,7 +80,8 @@ def watch(players: Sequence[Player], episodes: int, target_yaw: float) -> Visits
         if jitterbug_task(player.task) is None:
             raise SystemExit(f"{player.name}: only the Jitterbug's tasks have its motor")
         for first in range(0, episodes, BATCH):
-            for each in player.play(range(first, min(first + BATCH, episodes)), target_yaw):
+            some = range(first, min(first + BATCH, episodes))
+            for each in player.play(some, lambda lanes: turn_targets(lanes, target_yaw)):
                 returns.append(each.episode_return)
                 motor.append(each.motion.qvel[:, -1].copy())  # a view would keep all
                 place.append(each.motion.qpos[:, :2].copy())

@@ -8,7 +8,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
 import click
@@ -37,33 +37,6 @@ class _Mistake(click.ClickException):
 
     def __init__(self, message: str):
         super().__init__(printable(message))
-
-
-@contextmanager
-def _own_output() -> Iterator[None]:
-    """Keep standard output for jbrep: what an environment's C code prints there is an error's."""
-    try:
-        is_usual = (sys.stdout.fileno(), sys.stderr.fileno()) == (1, 2)
-    except (AttributeError, OSError, ValueError):
-        is_usual = False
-    if not is_usual:
-        yield
-        return
-    before, sys_before, kept = sys.stdout, sys.__stdout__, os.dup(1)
-    before.flush()
-    os.dup2(2, 1)
-    own = os.fdopen(kept, "w", encoding=before.encoding, errors=before.errors)
-    own.reconfigure(line_buffering=own.isatty())
-    sys.stdout = sys.__stdout__ = own  # type: ignore[misc]
-    try:
-        yield
-    finally:
-        with suppress(OSError, ValueError):  # such as a pipe that nobody reads
-            own.flush()
-        os.dup2(kept, 1)
-        sys.stdout, sys.__stdout__ = before, sys_before  # type: ignore[misc]
-        with suppress(OSError, ValueError):
-            own.close()
 
 
 @contextmanager
@@ -108,7 +81,7 @@ class _Cli(click.Group):
         self.format_commands(ctx, formatter)
 
     def main(self, *args: Any, **options: Any) -> Any:
-        with _own_output(), _notices(), _closing():
+        with _notices(), _closing():
             return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> None:
@@ -116,10 +89,10 @@ class _Cli(click.Group):
             super().invoke(ctx)
         except InputError as error:
             raise _Mistake(str(error)) from None
-        except OSError as error:  # of what writes files in its own way, as TensorBoard does
-            if mistake := _mistake_of(error):
-                raise mistake from None
-            raise
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG):
+                raise
+            raise _Mistake(f"{error}: free some space, or choose another name") from None
         except click.exceptions.NoArgsIsHelpError:
             raise  # of a group, whose help it shows
         except click.UsageError as error:
@@ -134,19 +107,6 @@ class _Cli(click.Group):
             if extra is None:
                 raise
             raise _Mistake(f"this needs {error.name}: pip install 'jbrep[{extra}]'") from None
-
-
-def _mistake_of(error: OSError) -> _Mistake | None:
-    """What the system refuses as a user's mistake, if it is one."""
-    what = f" {error.filename}" if error.filename else ""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return _Mistake(
-            f"can't write{what}: {os.strerror(error.errno)}; free some space, then run the same "
-            "command again"
-        )
-    if error.errno == errno.ENAMETOOLONG:
-        return _Mistake(f"can't use{what}: {os.strerror(error.errno).lower()}; choose another")
-    return None
 
 
 @click.group(

@@ -11,7 +11,7 @@ from jbrep.cli.base import command, say, say_json, tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
 from jbrep.parameters import AsJson, NeededTask, OptionalTask, TaskName
-from jbrep.text import facts, r2_text, slug, table, terminal_width
+from jbrep.text import r2_text, slug, table, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.encoders import Encoder
@@ -45,7 +45,7 @@ def evaluate(
     Args:
         encoders: files, names that ship, or code, mymodule:MyEncoder; one or several.
         data: a folder from jbrep collect.
-        out: a folder for evaluation.json and figures; by default evaluation/DATA/ENCODERS.
+        out: a folder for evaluation.json; by default evaluation/DATA/ENCODERS.
         everything: show all other diagnostics, too; evaluation.json always has them.
     """
     from jbrep.dataset import Dataset
@@ -56,8 +56,6 @@ def evaluate(
         check_found(name, whole.task)
     from jbrep.evaluation.evaluation import EVALUATION  # imports torch
     from jbrep.reporting.evaluation import evaluation_text
-    from jbrep.reporting.figures import encoder_plots
-    from jbrep.reporting.figures import write as write_plots
 
     found = find_all(encoders, whole.task)
     sources = {
@@ -66,15 +64,12 @@ def evaluate(
     out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(found))[:_LETTERS])
     with stoppable("the same command starts over"):
         evaluation = api.evaluate(found, whole, out, **options).evaluation
-        pictures = write_plots(encoder_plots(evaluation), out)
     if as_json:
         _tell_notes(found, sources, evaluation, err=True)
         return say_json(evaluation.as_json())
     say(evaluation_text(evaluation, terminal_width(), everything) + "\n")
     _tell_notes(found, sources, evaluation)
-    say(f"\n{out / EVALUATION}")
-    more = "" if everything else " --all shows more."
-    return say(f"Beside it: {len(pictures)} figures.{more}")
+    return say(f"\n{out / EVALUATION}")
 
 
 def _tell_notes(
@@ -102,19 +97,10 @@ _COLUMNS = {  # by the names of diagnostics, those of the columns
     **{name: name for name in ("forward", "rewarded", "reward", "value", "action")},
     "times_pca": "error",
 }
-_LEGEND = {
-    "l": "size of the code",
-    "forward": "R² of the features' change over 10 steps",
-    "rewarded": "the same of what the reward depends on",
-    "reward": "R² of the mean reward of 10 steps",
-    "value": "R² of a good policy's return to go",
-    "action": "R² of a good policy's action",
-    "error": "squared error of the reconstruction, as a multiple of PCA's",
-}
 
 
 @command("encoder list --task face_direction")
-def list_shipped(*, task: TaskName = None, as_json: AsJson = False) -> None:
+def list_shipped(*, task: TaskName = None) -> None:
     """Show which encoders ship, and how they were judged.
 
     A dash stands for what isn't known; jbrep evaluate finds out.
@@ -129,9 +115,6 @@ def list_shipped(*, task: TaskName = None, as_json: AsJson = False) -> None:
     listed = {
         name: _with_diagnostics(TASKS[name].describe()) for name in ([task] if task else TASKS)
     }
-    if as_json:
-        plain = {name: [_plain(*each) for each in some] for name, some in listed.items()}
-        return say_json(plain)
     width = terminal_width()
     for name, encoders in listed.items():
         rows = [
@@ -139,20 +122,8 @@ def list_shipped(*, task: TaskName = None, as_json: AsJson = False) -> None:
             for called, each, known in encoders
         ]
         say(f"{name}\n{table(('encoder', 'l', *_COLUMNS.values()), rows, width)}\n")
-    say(f"columns\n{facts(_LEGEND, width)}\n")
-    return tell("What the kinds of encoders are, jbrep train-encoder --help says.")
-
-
-def _plain(name: str, encoder: "Encoder", known: "Values") -> dict[str, Any]:
-    """An encoder that ships, as JSON has it."""
-    return {
-        "name": name,
-        "kind": encoder.kind,
-        "size": encoder.size,
-        "latent_size": encoder.latent_size,
-        "sha256": encoder.fingerprint,
-        "diagnostics": dict(known),
-    }
+    tell("Columns are R² on held-out episodes, and the error as a multiple of PCA's.")
+    tell("What the kinds of encoders are, jbrep train-encoder --help says.")
 
 
 def _with_diagnostics(task: "Task") -> "list[tuple[str, Encoder, Values]]":

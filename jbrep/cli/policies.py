@@ -34,7 +34,7 @@ _MAYBE = {"is_flag": False, "flag_value": ""}  # an option that may have no valu
 
 
 @command("policies")
-def policies(*, as_json: AsJson = False) -> None:
+def policies() -> None:
     """Show the trained policies that ship.
 
     Every command that takes a policy knows the one for its --task as trained, as in jbrep render
@@ -43,19 +43,6 @@ def policies(*, as_json: AsJson = False) -> None:
     from jbrep.rl.policy_file import SHIPPED, shipped
 
     ships = shipped()
-    if as_json:
-        return say_json(
-            {
-                policy.task: {
-                    "observes": policy.observes,
-                    "learner": policy.learner,
-                    "steps": policy.steps,
-                    "episodes": len(policy.returns[SHIPPED]),
-                    **{name: percentiles(each) for name, each in policy.returns.items()},
-                }
-                for policy in ships
-            }
-        )
     rows = [
         (task, observes, learner, f"{steps:,}", *map(interval_of, returns.values()))
         for task, observes, learner, steps, returns in ships
@@ -64,7 +51,7 @@ def policies(*, as_json: AsJson = False) -> None:
     say(table(header, rows, terminal_width()))
     episodes = len(ships[0].returns[SHIPPED])
     say(f"\nreturns: median [10 %, 90 %] of the same {episodes} episodes")
-    return tell("falling: the preset wide, but with a learning rate that falls to 0")
+    tell("falling: the preset wide, but with a learning rate that falls to 0")
 
 
 @command("policy export runs/a --out controller.onnx")
@@ -268,7 +255,7 @@ def _perturb(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Show the rows of a table as they are finished, and write those so far."""
+    """Show how much of its return a policy keeps, and write that."""
     from jbrep.play.perturbed import HEADER, Table, domains_of, perturb
     from jbrep.records.storage import make_folder
 
@@ -278,34 +265,22 @@ def _perturb(
     if lacking and not chosen:
         told = f"{player.task.name} has no {', '.join(lacking)} that could be changed"
         tell(f"Note: {told}: left out", err=True)
+    with stoppable("no table was made"):
+        rows = tuple(perturb(player, domains, *how))
     result = Table(
         policy=policy,
         task=player.task.name,
         representation=player.representation,
         step=player.step,
-        rows=(),
+        rows=rows,
     )
-    left = max(map(len, (*domains, HEADER[0])))
-    if not as_json:
-        tell(f"{_title(policy, player)}, each row the same {counted(how[0], 'episode')}")
-        say("")
-        say(_line(HEADER, left))
-    with stoppable("the rows so far are complete"):
-        for row in perturb(player, domains, *how):
-            result = result.replace(rows=(*result.rows, row))
-            if out:
-                result.write(out)
-            if not as_json:
-                say(_line(row.cells, left))
+    if out:
+        result.write(out)
     if as_json:
-        say_json(to_plain(result))
-    elif out:
-        say(f"\n{out}")
-
-
-def _line(cells: Sequence[str], left: int) -> str:
-    first, *others = cells
-    return "  ".join((first.ljust(left), *(cell.rjust(25) for cell in others)))
+        return say_json(to_plain(result))
+    tell(f"{_title(policy, player)}, each row the same {counted(how[0], 'episode')}")
+    say(f"\n{table(HEADER, [row.cells for row in rows], terminal_width())}")
+    return say(f"\n{out}") if out else None
 
 
 def _title(policy: str, player: "Player") -> str:

@@ -30,12 +30,12 @@ def _rl(
         from jbrep.envs.infos import shares_text
         from jbrep.envs.make import is_one_robot
         from jbrep.play.references import beside
-        from jbrep.rl.files import EVALUATIONS, last_infos, read_evaluations, read_infos
+        from jbrep.rl.files import EVALUATIONS, RUN, last_infos, read_evaluations, read_infos
 
         with _told_when_stopped(received, f"; {RESUMES}" if task.reproducible else ""):
             agent = api.train(task, out, stop=lambda: bool(received), **options)
     if agent.record.reason is not None:
-        say(f"the run failed: {agent.record.reason}; {_left(out)}", err=True)
+        say(f"the run failed: {agent.record.reason}; see {out / RUN}", err=True)
         return True
     returns = agent.returns
     name = agent.record.settings.representation
@@ -49,16 +49,6 @@ def _rl(
     tell(f"encoder: {source_of(options.get('encoder', 'full'), task)}; all evaluations:")
     say(str(out / EVALUATIONS))
     return False
-
-
-def _left(folder: Path) -> str:
-    """What a run that failed has left."""
-    from jbrep.rl.files import FAILED, RUN, read_run
-
-    left = read_run(folder)
-    if left.status == FAILED:
-        return f"see {folder / RUN}"
-    return f"{folder} still has what its first {left.steps:,} steps made, and its last checkpoint"
 
 
 @command(

@@ -1,10 +1,8 @@
 """What Ctrl-C and SIGTERM do."""
 
-import _thread
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -37,23 +35,12 @@ def on_stop(handle: Callable[[int, FrameType | None], object]) -> Iterator[None]
 @contextmanager
 def stoppable(afterwards: str) -> Iterator[None]:
     """Ctrl-C and SIGTERM end the command, with a line on what follows from that."""
-
-    def repeat(dropped: "sys.UnraisableHookArgs") -> None:
-        """Send the signal again: Python drops what is raised while an object is destroyed."""
-        if isinstance(stopped := dropped.exc_value, SystemExit) and isinstance(stopped.code, int):
-            threading.Timer(0.1, _thread.interrupt_main, [stopped.code - 128]).start()
-        else:
-            usual(dropped)
-
-    usual, sys.unraisablehook = sys.unraisablehook, repeat
     with on_stop(leave):
         try:
             yield
         except SystemExit:
             click.echo(f"stopped; {afterwards}", err=True)
             raise
-        finally:
-            sys.unraisablehook = usual
 
 
 @contextmanager

@@ -44,14 +44,11 @@ def study(
             version, before the first run.
     """
     from jbrep.records.document import read_toml
-    from jbrep.records.storage import exists
 
     if dry_run and register:
         raise InputError("--dry-run and --register exclude each other: choose one")
     if register and (workers or backend != "local"):
         raise InputError("--register runs nothing: leave out --workers and --backend")
-    if not exists(study):
-        raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)
     from jbrep.studies.runner import BACKENDS  # imports torch
 
@@ -89,7 +86,7 @@ def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> N
 
 
 def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
-    """The runs to go, how long they would take, and what could be found of its claims."""
+    """The runs to go, their time, and what could be found of the study's claims."""
     from jbrep.reporting.views import in_text, probability, say
     from jbrep.stats.power import BETTER_BY, EARLIER_BY, SDS
 
@@ -100,11 +97,6 @@ def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
         "agents": lambda item: item[0],
         "runs": lambda item: str(len(item[1])),
         "time of each": lambda item: duration(max(item[1])),
-    }
-    made_first: Cells = {
-        "made first": lambda each: each.what,
-        "to go": lambda each: str(each.to_go),
-        "done": lambda each: str(each.done),
     }
     prospects: Cells = {
         "on": lambda each: each.where,
@@ -118,7 +110,6 @@ def _forecast_text(forecast: "Forecast", planned: "Planned", width: int) -> str:
     parts: list[str | Table] = [Table.of("", to_go.items(), runs)] if to_go else []
     on_one_core = sum(seconds for _, seconds in forecast.runs)
     parts.append(say("forecast", forecast, duration(on_one_core), duration(forecast.elapsed)))
-    parts += [Table.of("", forecast.made_first, made_first)] if forecast.made_first else []
     if forecast.prospects:
         count = len(planned.rules.chains) * len(planned.groups)
         parts.append(Table.of("", forecast.prospects, prospects))

@@ -2,7 +2,6 @@
 
 import os
 import re
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -17,9 +16,6 @@ from jbrep.errors import InputError
 from jbrep.parameters import OptionalTask
 from jbrep.text import facts, printable, terminal_width
 
-_ADDRESS = "127.0.0.1"
-# Waits for the end of its input, which comes when jbrep ends, even killed; then ends its own group.
-_KEEPER = ("sh", "-c", "read -r _; kill 0")
 _Number = Annotated[int, Meta(ge=0, le=10**9)]
 
 
@@ -34,7 +30,6 @@ def inspect(
     traverse: bool = False,
     out: Path | None = None,
     view: bool = False,
-    serve: bool = False,
 ) -> None:
     """Record an episode or encoder to see in Rerun.
 
@@ -49,12 +44,7 @@ def inspect(
         traverse: show what each unit of the latent moves.
         out: an .rrd file; one in inspect/ if not given.
         view: open it in the Rerun viewer.
-        serve: show it to a browser on this machine until Ctrl-C. Meanwhile every user and program
-            of the machine can read the recording, too; Rerun asks for no password and checks no
-            host name.
     """
-    if view and serve:
-        raise InputError("--view and --serve exclude each other: choose one")
     from jbrep.encoders.shipped import check_found
     from jbrep.play.sources import check_source
     from jbrep.records.storage import exists
@@ -66,43 +56,17 @@ def inspect(
     from jbrep.inspection import inspect as record  # imports torch
 
     path = record(source, episode, task, encoder, traverse, out, say)
-    if view or serve:
-        say(str(path))
-    else:
-        say("open it with:")
-        say(f"rerun {quote(str(path))}")
+    say("open it with:")
+    say(f"rerun {quote(str(path))}")
     if view:
         _run_viewer(path)
-    if serve:
-        page, recording = _free_ports()
-        say(f"http://{_ADDRESS}:{page}/?url=rerun%2Bhttp://{_ADDRESS}:{recording}/proxy")
-        say("Ctrl-C stops it")
-        ports = ("--web-viewer-port", str(page), "--port", str(recording))
-        _run_viewer(path, "--serve-web", *ports)
 
 
-def _free_ports() -> tuple[int, int]:
-    """Unused ports: on one in use, Rerun would connect to the program that listens there."""
-    anything = (_ADDRESS, 0)
-    with socket.create_server(anything) as one, socket.create_server(anything) as other:
-        return one.getsockname()[1], other.getsockname()[1]
-
-
-def _run_viewer(path: Path, *options: str) -> None:
-    """Run Rerun's viewer until it ends, or this process does in whatever way."""
-    command = [sys.executable, "-m", "rerun", "--bind", _ADDRESS, *options, str(path)]
-    quiet = {"RUST_LOG": "warn", **os.environ}
-    with (
-        stoppable(f"{path} stays"),
-        subprocess.Popen(_KEEPER, stdin=subprocess.PIPE, process_group=0) as keeper,
-        # in the keeper's group, as is the program that this script starts
-        subprocess.Popen(command, process_group=keeper.pid, env=quiet) as viewer,
-    ):
-        try:
-            code = viewer.wait()
-        finally:
-            assert keeper.stdin is not None
-            keeper.stdin.close()
+def _run_viewer(path: Path) -> None:
+    """Run Rerun's viewer until it ends."""
+    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(path)]
+    with stoppable(f"{path} stays"):
+        code = subprocess.run(command, env={"RUST_LOG": "warn", **os.environ}).returncode
     if code:
         raise InputError(f"the Rerun viewer ended with code {code}; {path} stays")
 
@@ -115,15 +79,14 @@ def render(
     episode: _Number = 0,
     camera: str | None = None,
     size: Annotated[str, Meta(extra={"metavar": "WIDTHxHEIGHT"})] = "",
-    fps: float | None = None,
-    speed: float = 1.0,
-    seconds: float | None = None,
+    fps: Annotated[float, Meta(ge=1, le=50)] | None = None,
+    speed: Annotated[float, Meta(ge=0.01, le=100)] = 1.0,
+    seconds: Annotated[float, Meta(ge=0.001, le=3600)] | None = None,
 ) -> None:
     """Make a video of episodes, side by side.
 
     A source is the folder of a data set or of a run, or the name of a policy, such as uniform,
-    heuristic, trained or constant:drive=0.5, which needs a --task. Robots of MuJoCo are seen by a
-    camera; another environment draws itself, by its own render() with render_mode="rgb_array".
+    heuristic, trained or constant:drive=0.5, which needs a --task. Robots of MuJoCo can be filmed.
     The Jitterbug's motor turns up to 23 times a second: at full speed and 25 frames per second it
     seems to creep backwards; --speed 0.25 shows how it turns.
 

@@ -19,7 +19,7 @@ from jbrep.dataset.scaling import EXTREMA, Scaler, extrema, fit_scaler, mean_and
 from jbrep.dataset.schema import Columns, episode_bounds, episode_columns
 from jbrep.dataset.settings import policy_text
 from jbrep.errors import InputError
-from jbrep.text import Table, counted, facts, html, number
+from jbrep.text import Table, counted, facts, number
 
 _OPEN_SHARDS = 100  # memory-mapped at a time, at most: each takes a file descriptor
 _AHEAD = 8  # shards that are checked at a time, at most
@@ -233,15 +233,6 @@ class Dataset:
 
     def card(self, width: int = 80) -> str:
         """`describe` as text of at most `width` columns."""
-        named, table = self._card()
-        told = f"{self.folder}\n{facts(named, width)}"
-        return f"{told}\n\n{table.text(width)}" if table.rows else told
-
-    def _repr_html_(self) -> str:
-        named, table = self._card()
-        return html(Table(str(self.folder), ("", ""), [*named.items()]), table)
-
-    def _card(self) -> tuple[dict[str, str], Table]:
         about, rows = self.describe(), []
         for each in about.pop("features"):
             low, high = each["nominal"]
@@ -272,7 +263,8 @@ class Dataset:
             named["reward"] = f"by {code}"
         if note := about.get("note"):
             named["note"] = note
-        return named, Table("", _RANGES, rows)
+        told = f"{self.folder}\n{facts(named, width)}"
+        return f"{told}\n\n{Table('', _RANGES, rows).text(width)}" if rows else told
 
 
 def _spread_text(values: Mapping[str, float]) -> str:

@@ -13,7 +13,7 @@ from jbrep.inspection.recording import PROVENANCE
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import ROBOT, TRAIL, WORLD
 from jbrep.inspection.signals import PATH, STEP, TIME, numbered_panels, panels
-from jbrep.play.jitterbug import jitterbug_task
+from jbrep.jitterbug.tasks import jitterbug_task
 
 TRAVERSE = "traverse"  # a timeline, and the parent entity of its series
 _BACKGROUND = (38, 42, 50)
@@ -47,7 +47,7 @@ def episode_layout(task: Task, robot: Robot | None, encoder: BaseEncoder | None)
         numbers.append(_tabs(_pages("latent", units)))
     actions = numbered_panels("action", task.action_size)
     acting = _pages("action", [_series(path, [path], **near) for path in actions])
-    numbers.append(rrb.Horizontal(*acting, _series("reward", ["reward/**"])))
+    numbers.append(rrb.Horizontal(*acting, _series("reward", ["reward/total"])))
     shares = [1.2 * len(numbers), *[1.2] * (len(numbers) - 2), 1]
     column = rrb.Vertical(*numbers, row_shares=shares)
     scene: list[rrb.View] = []

@@ -30,35 +30,11 @@ _KINDS: dict[int, Any] = {
 }
 
 
-def rotate(quaternion: Array, vector: Array) -> Array:
-    """Vectors (..., 3) rotated by quaternions (..., 4)."""
-    scalar, axis = quaternion[..., :1], quaternion[..., 1:]
-    across = np.cross(axis, vector)
-    return vector + 2 * (scalar * across + np.cross(axis, across))
-
-
 class Poses(NamedTuple):
-    """Where the bodies of a model are in n states; of one body, without that axis."""
+    """Where the bodies of a model are in n states."""
 
     position: Array  # (n, bodies, 3) [m]
     quaternion: Array  # (n, bodies, 4)
-
-    def of(self, body: int, carrier: int | None = None) -> "Poses":
-        """Those of one body, in the world or in the frame of another."""
-        place, turned = self.position[:, body], self.quaternion[:, body]
-        if carrier is None:
-            return Poses(place, turned)
-        back = self.quaternion[:, carrier] * (1, -1, -1, -1)
-        scalar = (back * turned * (1, -1, -1, -1)).sum(axis=1, keepdims=True)
-        axis = back[:, :1] * turned[:, 1:] + turned[:, :1] * back[:, 1:]
-        axis += np.cross(back[:, 1:], turned[:, 1:])
-        away = rotate(back, place - self.position[:, carrier])
-        return Poses(away, np.concatenate((scalar, axis), axis=1))
-
-    @property
-    def is_still(self) -> bool:
-        """Whether they are the same in all states, but for rounding."""
-        return all(np.ptp(values, axis=0).max() < _ROUNDING for values in self)
 
 
 class Robot:
@@ -70,13 +46,11 @@ class Robot:
         model: the MuJoCo model.
         colours: of all geoms, (geoms, 4).
         names: of all bodies as parts of paths, each a different one.
-        paths: of all bodies; the robot's others are below its root, and move with it.
         root: number of the body that carries the robot's others.
         bodies: numbers of the robot's bodies, the root first.
         others: numbers of all other bodies, such as the world and a target.
         place: of the root in the model's reference pose, (3,) [m].
         size: from the root's origin to the farthest point of the robot, in the same pose [m].
-        weight: of the robot [N].
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -89,12 +63,6 @@ class Robot:
         roots = model.body_rootid if self.root else np.zeros(model.nbody, int)
         self.bodies = np.flatnonzero(roots == self.root).tolist()
         self.others = np.flatnonzero(roots != self.root).tolist()
-        carrier = self.names[self.root]
-        self.paths = [
-            f"{carrier}/{name}" if body in self.bodies and body != self.root else name
-            for body, name in enumerate(self.names)
-        ]
-        self.weight = float(model.body_subtreemass[self.root] * np.linalg.norm(model.opt.gravity))
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         self.place = data.xpos[self.root].copy()
@@ -127,7 +95,7 @@ class Robot:
         bodies: Iterable[int],
         colours: NDArray[np.uint8] | None = None,
     ) -> None:
-        """Draw bodies as entities below `root`; what doesn't move in its frame is sent once.
+        """Draw bodies as entities below `root`; what doesn't move is sent once.
 
         Poses are of all bodies in n states; colours of each drawn one in each state, (n,
         len(bodies), 4), or their own.
@@ -138,11 +106,9 @@ class Robot:
             static: list[Any] = shapes(self.model, geoms, own)
             if colours is not None:
                 columns = [type(shape).columns(colors=colours[:, i]) for shape in static]
-            is_carried = self.paths[body] != self.names[body]
-            there = poses.of(body, self.root if is_carried else None)
-            path, place, turned = f"{root}/{self.paths[body]}", *there
-            turned = turned[:, XYZW]
-            if there.is_still:
+            path, place = f"{root}/{self.names[body]}", poses.position[:, body]
+            turned = poses.quaternion[:, body][:, XYZW]
+            if max(np.ptp(place, axis=0).max(), np.ptp(turned, axis=0).max()) < _ROUNDING:
                 still = rr.Quaternion(xyzw=turned[0])
                 static.append(rr.Transform3D(translation=place[0], quaternion=still))
             else:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Array, Task
 from jbrep.inspection.recording import GREY, SKY, YELLOW, Recording, pieces
-from jbrep.play.jitterbug import reward_terms
 from jbrep.play.rollout import Rollout
 
 STEP = "step"
@@ -58,7 +57,7 @@ def times_at(task: Task, steps: NDArray[np.int64]) -> list[rr.TimeColumn]:
 
 
 def send_signals(recording: Recording, rollout: Rollout) -> None:
-    """Send observations, actions, and the rewards with their factors, as far as they are known."""
+    """Send observations, actions and rewards, as far as they are known."""
     task, states = rollout.task, np.arange(len(rollout) + 1)
     titles, times = [str(feature) for feature in task.features], times_at(task, states)
     send_features(recording, "observation", times, task, rollout.observation, titles)
@@ -70,10 +69,6 @@ def send_signals(recording: Recording, rollout: Rollout) -> None:
     if np.isfinite(rollout.reward).any():
         total, led_to = rollout.reward[:, None], times_at(task, states[1:])
         recording.send_series("reward/total", led_to, total, ["reward"], [GREY])
-    terms = reward_terms(task, rollout.motion) if rollout.motion else {}
-    if terms:
-        values = np.stack(list(terms.values()), axis=1)
-        recording.send_series("reward/terms", times, values, [f"{name} [1]" for name in terms])
 
 
 def send_features(

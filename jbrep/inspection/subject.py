@@ -22,10 +22,9 @@ from jbrep.errors import InputError
 from jbrep.inspection.blueprint import TRAVERSE, episode_layout, traversal_layout
 from jbrep.inspection.recording import GREY, SUFFIX, Recording, check_out
 from jbrep.inspection.robot import Robot
-from jbrep.inspection.scene import WORLD, as_qpos, send_floor, send_ghost, send_scene
+from jbrep.inspection.scene import WORLD, as_qpos, send_ghost, send_scene
 from jbrep.inspection.signals import scaled_titles, send_encoding, send_signals, times_at
-from jbrep.jitterbug.tasks import POSITION
-from jbrep.play.jitterbug import jitterbug_task
+from jbrep.jitterbug.tasks import POSITION, jitterbug_task
 from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode, is_trained, run_folder
 from jbrep.records.storage import exists
@@ -51,20 +50,11 @@ def inspect(
 ) -> Path:
     """Write the Rerun recording of an episode, or of a latent's units.
 
-    Args:
-        source: a data set's folder, or a run's; an encoder's file, or a policy's name; an encoder
-            alone is shown on an episode under uniformly random actions. A run that is not over
-            plays its last checkpoint.
-        episode: its number, from 0; the first if not given.
-        task: of a policy or encoder by its name; a run plays it instead of its own.
-        encoder: a file, the name of one that ships, code, or an object that encodes, as
-            `jbrep.encoders.find` takes it; a run's own if not given.
-        traverse: whether to show what each unit of the latent moves, instead of the episode.
-        out: the .rrd file; one in inspect/, named after its content, if not given.
-        tell: called with a line on where an encoder is from, and on a robot that can't be shown.
+    Parameters are those of the command; an encoder may also be an object that encodes, and `tell`
+    is called with lines on where it is from and on a robot that can't be shown.
 
     Returns:
-        The file.
+        The .rrd file.
     """
     if out:
         check_out(out)
@@ -200,7 +190,6 @@ def record_traversal(rollout: Rollout, path: Path, encoder: BaseEncoder) -> None
     if rollout.motion and jitterbug_task(task):
         robot = Robot(rollout.motion.model)
         recording.send(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        send_floor(recording, robot, places)
     summary = ["| unit | from | to | moves most |", "|---|---|---|---|"]
     for unit, (latent, place) in enumerate(zip(swept, places, strict=True)):
         decoded, below = encoder.decode(latent).astype(np.float64), f"{TRAVERSE}/unit_{unit}"

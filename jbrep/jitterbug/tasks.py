@@ -339,6 +339,13 @@ def environment_id(task: str) -> str:
     return f"Jitterbug/{task.title().replace('_', '')}-v0"
 
 
+def jitterbug_task(task: Task) -> JitterbugTask | None:
+    """The task as the Jitterbug's own; None for another robot's, or if not all of it is seen."""
+    if task.view:
+        return None
+    return next((own for own in TASKS.values() if environment_id(own.name) == task.id), None)
+
+
 def register() -> None:
     """Register the five tasks and their short names; with jbrep, Gymnasium's import calls this."""
     import gymnasium

@@ -1,173 +1,41 @@
-"""Films: episodes as a sequence of frames, in files of H.264 (MP4) or GIF.
+"""Films: MuJoCo's states as a sequence of frames, in files of H.264 (MP4) or GIF."""
 
-They show pictures of MuJoCo's states, or what an environment draws by itself.
-"""
-
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image
 
-from jbrep.envs.lanes import Lanes
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import InputError
 from jbrep.play.pictures import Camera, add_caption, join
 from jbrep.play.rollout import Rollout
 from jbrep.progress import Progress
 from jbrep.records.storage import exists, make_folder, taken, write_new
 
-_LONGEST = 3600  # [s]
-_SPEEDS = (0.01, 100)
 _WIDEST = 7680  # [pixels]
 _X264 = {"crf": "18", "preset": "medium"}  # no loss that the eye can see
 _TICK = 0.01  # GIF's unit of time [s]
 _SAMPLES = 8  # frames that the palette is computed from
 _COLOURS = 128  # files are a fifth smaller than with 256, and look the same
-_OWN = {"render_mode": "rgb_array"}
-_IN_MEMORY = 2e8  # [pixels], of three bytes
 
 
-@dataclass(frozen=True)
-class Pace:
+class Pace(NamedTuple):
     """How fast a film shows simulated time."""
 
     fps: float = 25  # frames per second of the film
     speed: float = 1  # simulated seconds per second of the film
     seconds: float | None = None  # simulated ones to show, from the start; None for all
 
-    def __post_init__(self) -> None:
-        for what, value, (low, high) in (
-            ("frames per second", self.fps, (1, 50)),
-            ("speed", self.speed, _SPEEDS),
-            ("simulated seconds", self.seconds, (0.001, _LONGEST)),
-        ):
-            if value is not None and not low <= value <= high:
-                raise InputError(f"{what} is {value:g}: it must be from {low:g} to {high:g}")
-
-
-class Scene(Protocol):
-    """An episode that pictures can be taken of.
-
-    Attributes:
-        timestep: from one state to the next [s].
-        start: equals that of another of the same task and from the same start.
-    """
-
-    timestep: float
-    start: Any
-
-    def pictures(self, states: Iterable[int]) -> Iterator[Image.Image]:
-        """Pictures of some of its states, which never go back, of the camera's size."""
-        ...
-
-
-def scene_of(rollout: Rollout, camera: Camera) -> Scene:
-    """What can be shown of an episode."""
-    if rollout.note:
-        raise InputError(f"{rollout.note}; it can't be filmed, but jbrep inspect shows its signals")
-    return Simulated(rollout, camera) if rollout.motion else Drawn(rollout, camera)
-
-
-class Simulated:
-    """The robot of MuJoCo, as a camera of its model sees it."""
-
-    def __init__(self, rollout: Rollout, camera: Camera):
-        assert rollout.motion is not None
-        self._motion, self._camera = rollout.motion, camera
-        places = [rollout.motion.arrays[name][0] for name in ("qpos", "mocap_pos", "mocap_quat")]
-        self.start = rollout.task, [place.tolist() for place in places]
-        self.timestep = rollout.task.known_timestep
-
-    def pictures(self, states: Iterable[int]) -> Iterator[Image.Image]:
-        for state in states:
-            yield Image.fromarray(self._camera.picture(self._motion, state))
-
-
-class Drawn:
-    """What an environment draws by its own `render()`, while the episode is played once more.
-
-    Where the time step is not known, its films have as many states a second as its metadata say.
-    """
-
-    def __init__(self, rollout: Rollout, camera: Camera):
-        task = rollout.task
-        if camera.name is not None:
-            raise InputError(f"{task.name} draws itself, without a camera: leave out --camera")
-        if not task.reproducible:
-            raise InputError(
-                f"{task.name} has no MuJoCo model and data, and is not reproducible: it can't be "
-                "played again to be drawn; jbrep inspect shows signals"
-            )
-        self._rollout, self._size = rollout, (camera.width, camera.height)
-        self.start = task, rollout.seed
-        self._task = task.replace(arguments={**task.arguments, **_OWN})
-        with self._begin() as lanes:
-            self._draw(lanes)  # or it isn't possible
-            fps = lanes.metadata.get("render_fps")
-        self.timestep = task.timestep or (1 / fps if fps else task.known_timestep)
-
-    def pictures(self, states: Iterable[int]) -> Iterator[Image.Image]:
-        step = 0
-        with self._begin() as lanes:
-            for state in states:
-                while step < state:
-                    lanes.step(self._rollout.action[None, step])
-                    step += 1
-                    self._check_same(lanes, step)
-                yield self._draw(lanes)
-
-    def _begin(self) -> Lanes:
-        try:
-            lanes = Lanes(self._task, 1)
-        except InputError as error:
-            raise self._not_drawn(str(error)) from error
-        try:
-            lanes.reset([0], [self._rollout.seed])
-            self._check_same(lanes, 0)
-        except BaseException:
-            lanes.close()
-            raise
-        return lanes
-
-    def _check_same(self, lanes: Lanes, state: int) -> None:
-        seen = lanes.observation[0].astype(np.float32)
-        if seen.tobytes() != self._rollout.observation[state].tobytes():
-            raise self._not_drawn(f"played once more, it differs at step {state}")
-
-    def _draw(self, lanes: Lanes) -> Image.Image:
-        try:
-            (drawn,) = lanes.render()
-        except Exception as error:  # whatever the environment raises
-            raise self._not_drawn(f"its render() fails: {kind_and_line(error)}") from error
-        picture: Any = np.asarray(drawn)
-        if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
-            given = f"{picture.dtype} {picture.shape}" if picture.ndim else repr(drawn)
-            raise self._not_drawn(
-                f"its render() gives {given}: it must be a picture, uint8 (height, width, 3)"
-            )
-        return ImageOps.pad(Image.fromarray(picture), self._size)
-
-    def _not_drawn(self, why: str) -> InputError:
-        return InputError(
-            f"{self._rollout.task.name} has no MuJoCo model and data, and with "
-            f"render_mode='rgb_array' it can't draw itself: {why}"
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """Episodes side by side; one that ends before the others stands still afterwards.
-
-    Robots of MuJoCo are seen by a camera of their model; other environments draw themselves.
-    """
+    """Episodes side by side; one that ends before the others stands still afterwards."""
 
     rollouts: Sequence[Rollout]  # of the same task and from the same start
     camera: Camera
@@ -179,8 +47,9 @@ class Film:
                 f"{len(self.rollouts)} pictures side by side are {self.width:,} pixels wide: at "
                 f"most {_WIDEST:,} are possible; choose a smaller --size"
             )
-        for rollout, scene in zip(self.rollouts, self.scenes, strict=True):
-            if scene.start != self.scenes[0].start:
+        first, *_ = starts = [_start(rollout) for rollout in self.rollouts]
+        for rollout, start in zip(self.rollouts, starts, strict=True):
+            if start != first:
                 raise InputError(
                     f"{self.rollouts[0].name} and {rollout.name} differ in their task or start: "
                     "only episodes that share both can be shown side by side, as those of policies "
@@ -202,15 +71,10 @@ class Film:
         shown = longest if self.pace.seconds is None else min(self.pace.seconds, longest)
         return max(1, round(shown / self.pace.speed * self.pace.fps))
 
-    @cached_property
-    def scenes(self) -> Sequence[Scene]:
-        """What is shown of each episode."""
-        return [scene_of(rollout, self.camera) for rollout in self.rollouts]
-
     @property
     def timestep(self) -> float:
         """From one state to the next [s]."""
-        return self.scenes[0].timestep
+        return self.rollouts[0].task.known_timestep
 
     @property
     def states(self) -> NDArray[np.int_]:
@@ -220,13 +84,14 @@ class Film:
 
     def frames(self) -> Iterator[Image.Image]:
         """The frames in order."""
-        every = [self._pictures(*each) for each in zip(self.rollouts, self.scenes, strict=True)]
+        every = [self._pictures(rollout) for rollout in self.rollouts]
         for pictures in zip(*every, strict=True):
             yield join(pictures)
 
-    def _pictures(self, rollout: Rollout, scene: Scene) -> Iterator[Image.Image]:
-        states = np.minimum(self.states, len(rollout)).tolist()
-        for state, picture in zip(states, scene.pictures(states), strict=True):
+    def _pictures(self, rollout: Rollout) -> Iterator[Image.Image]:
+        assert rollout.motion
+        for state in np.minimum(self.states, len(rollout)).tolist():
+            picture = Image.fromarray(self.camera.picture(rollout.motion, state))
             so_far, now = rollout.reward[:state].sum(dtype=np.float64), self.timestep * state
             add_caption(picture, rollout.name, f"return {so_far:.0f}    {now:.2f} s")
             yield picture
@@ -234,12 +99,6 @@ class Film:
     def write(self, path: Path, show: bool = False) -> None:
         """Encode it into a new file, whole or not at all."""
         form = get_format(path)
-        pixels = len(self) * self.width * self.camera.height
-        if pixels > form.most_pixels:
-            raise InputError(
-                f"{path} would have {pixels:,} pixels: at most {form.most_pixels:,.0f} fit into "
-                f"a {path.suffix} file; choose a smaller --size or --fps, fewer --seconds, or .mp4"
-            )
         make_folder(path.parent)
         with (
             TemporaryDirectory() as folder,
@@ -252,13 +111,29 @@ class Film:
             write_new(path, encoded.read_bytes())
 
 
+def _start(rollout: Rollout) -> tuple[Any, ...]:
+    """What episodes that can be shown side by side share."""
+    if rollout.note:
+        raise InputError(f"{rollout.note}; it can't be filmed, but jbrep inspect shows its signals")
+    if rollout.motion is None:
+        raise InputError(
+            f"{rollout.task.name} has no MuJoCo model and data: it can't be filmed, but jbrep "
+            "inspect shows its signals"
+        )
+    task, arrays = rollout.task, rollout.motion.arrays
+    return (
+        task,
+        task.known_timestep,
+        *(arrays[n][0].tolist() for n in ("qpos", "mocap_pos", "mocap_quat")),
+    )
+
+
 class Format(NamedTuple):
     """A file format, with the settings that suit it."""
 
     encode: Callable[[Iterable[Image.Image], Path, float], None]  # frames of one size; fps
     fps: float
     size: tuple[int, int]  # of a picture, width and height [pixels]
-    most_pixels: float = math.inf  # in all frames
 
 
 def encode_mp4(frames: Iterable[Image.Image], path: Path, fps: float) -> None:
@@ -296,7 +171,7 @@ def encode_gif(frames: Iterable[Image.Image], path: Path, fps: float) -> None:
 
 FORMATS = {
     ".mp4": Format(encode_mp4, 25, (640, 480)),
-    ".gif": Format(encode_gif, 12.5, (320, 240), _IN_MEMORY),
+    ".gif": Format(encode_gif, 12.5, (320, 240)),
 }
 
 

@@ -13,12 +13,9 @@ from jbrep.envs.make import is_batched
 from jbrep.envs.physics import MotionReader
 from jbrep.envs.recording import Actor, Outcome, Recording, joined, record, whole_outcome
 from jbrep.envs.task import Array, Task
-from jbrep.errors import InputError
-from jbrep.play.jitterbug import turn_targets
 from jbrep.play.rollout import Rollout
 from jbrep.progress import Progress
 from jbrep.rl.files import EVALUATION_SEED
-from jbrep.rl.settings import MAX_EPISODES
 
 Begin = Callable[[Task, Sequence[int]], Actor]  # as `Policy.begin`
 
@@ -36,15 +33,17 @@ class Player(NamedTuple):
     step: int | None = None  # of training, if it is not over
     encoder: BaseEncoder | None = None  # of a trained policy that doesn't observe all features
 
-    def play(self, episodes: Sequence[int], target_yaw: float | None = None) -> list[Rollout]:
+    def play(
+        self, episodes: Sequence[int], begun: Callable[[Lanes], object] = lambda lanes: None
+    ) -> list[Rollout]:
         """Play some of the episodes that every run is evaluated on.
 
         Args:
             episodes: their numbers, from 0.
-            target_yaw: where every target of the Jitterbug points [rad]; None draws it.
+            begun: what is done to them before their first step.
         """
         if len(episodes) > 1 and not self.task.reproducible:  # a robot may exist once
-            return [each for episode in episodes for each in self.play([episode], target_yaw)]
+            return [each for episode in episodes for each in self.play([episode], begun)]
         seeds = [EVALUATION_SEED + episode for episode in episodes]
         act, read = self.begin(self.task, seeds), MotionReader()
         with (
@@ -52,8 +51,7 @@ class Player(NamedTuple):
             _progress(len(seeds) * self.task.max_episode_steps) as bar,
         ):
             lanes.reset(range(len(seeds)), seeds)
-            if target_yaw is not None:
-                turn_targets(lanes, target_yaw)
+            begun(lanes)
             recording = record(lanes, act, bar.update, read)
         return [self._rollout(recording, lane, seed, read) for lane, seed in enumerate(seeds)]
 
@@ -102,7 +100,6 @@ class Player(NamedTuple):
         most = _BATCH_LANES
         if not is_batched(self.task):
             most = min(threads or _SEPARATE_LANES, _SEPARATE_LANES)
-        check_episodes(count)
         played = 0
         with _progress(count * self.task.max_episode_steps) as bar:
             while played < count:
@@ -135,9 +132,3 @@ class Player(NamedTuple):
 
 def _progress(steps: int) -> Progress:
     return Progress(total=steps, unit="step", unit_scale=True, leave=False, delay=1)
-
-
-def check_episodes(count: int) -> None:
-    """Make sure that an evaluation may have so many episodes."""
-    if count > MAX_EPISODES:
-        raise InputError(f"{count:,} episodes are too many: at most {MAX_EPISODES:,} are played")

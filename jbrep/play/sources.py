@@ -16,7 +16,7 @@ from jbrep.encoders import FULL
 from jbrep.envs.recording import Actor, held
 from jbrep.envs.task import Array, Task, check_same
 from jbrep.errors import DamageError, InputError, first_line, refusing
-from jbrep.play.jitterbug import jitterbug_task
+from jbrep.jitterbug.tasks import jitterbug_task
 from jbrep.play.player import Player
 from jbrep.play.rollout import Rollout, replay
 from jbrep.records.storage import exists, read_file
@@ -47,10 +47,7 @@ def find_episode(
                 f"{source} has its own arguments, time limit and features: leave out --task"
             )
         return replay(dataset, episode)
-    player = find_player(source, task, encoder)
-    if episode < 0:
-        raise InputError(f"there is no episode {episode}: they count from 0")
-    return player.play_one(episode)
+    return find_player(source, task, encoder).play_one(episode)
 
 
 def find_policy(text: str, folder: Path, task: Task) -> Policy:

@@ -7,7 +7,7 @@ from jbrep.encoders import FULL
 from jbrep.evaluation.diagnosis import SCALARS
 from jbrep.evaluation.evaluation import Diagnostics, Evaluation, Lost, Score
 from jbrep.reporting.views import say
-from jbrep.text import SIGNIFICANT, Table, facts, html, number, r2_text, wrapped
+from jbrep.text import SIGNIFICANT, Table, facts, number, r2_text, wrapped
 
 _MEASURES = {  # of which the first that the full observation tells anything of counts
     "rewarded": "the change of what the reward depends on",
@@ -38,11 +38,6 @@ def evaluation_text(
     return "\n\n".join(
         part.text(width) if isinstance(part, Table) else part for part in parts if part
     )
-
-
-def evaluation_html(evaluation: Evaluation) -> str:
-    """Which code to take and what each lacks, for a notebook."""
-    return html(*(part for part in _parts(evaluation, None) if part))
 
 
 def _parts(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from jbrep.progress import Progress
-from jbrep.records.storage import exclusive, exists, make_folder, write_whole
+from jbrep.records.storage import exclusive, make_folder, write_whole
 from jbrep.reporting import views
 from jbrep.reporting.diagnostics import add_diagnostics
 from jbrep.reporting.figures import Plot, study_plots, write
@@ -20,7 +20,7 @@ from jbrep.reporting.figures.panels import PAGE as WHOLE
 from jbrep.reporting.findings import Findings
 from jbrep.reporting.tables import Tables, read_tables
 from jbrep.studies.tables import Return, check_tables, has_runs, write_tables
-from jbrep.text import html, terminal_width
+from jbrep.text import terminal_width
 
 FINDINGS, PAGE, MARKDOWN, FIGURES = "findings.json", "report.html", "summary.md", "figures"
 _MAIN_FIGURE = "final_return.png"
@@ -50,14 +50,6 @@ class Report(NamedTuple):
 
     def __repr__(self) -> str:
         return f"{results_text(self.findings, terminal_width())}\n\n{self.page}"
-
-    def _repr_html_(self) -> str:
-        picture = self.folder / FIGURES / _MAIN_FIGURE
-        if not (self.findings.groups and exists(picture)):
-            return html(repr(self))
-        shown = f'<img width="700" src="data:image/png;base64,{_base64(picture.read_bytes())}">'
-        found = *views.returns_tables(self.findings), *views.verdict_tables(self.findings)
-        return html(*found) + shown + html(str(self.page))
 
 
 def make_report(

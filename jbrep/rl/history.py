@@ -22,10 +22,10 @@ from jbrep.records import tables
 from jbrep.records.record import to_plain
 from jbrep.rl.files import Episode, Evaluation, Info
 from jbrep.rl.run_settings import RunSettings
-from jbrep.text import rounded, sparkline
+from jbrep.text import rounded
 
 _LINE = "{desc}: {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"  # on a terminal
-_NAME, _CURVE = 16, 10  # letters and blocks in it, at most
+_NAME = 16  # letters in it, at most
 _TENSORBOARD = "tensorboard"  # what is kept from it is kept from Weights & Biases, too
 
 
@@ -71,10 +71,7 @@ class History:
 
 
 class Bar:
-    """A line of progress, from the step on at which the run starts or resumes.
-
-    On a terminal it has a curve of the evaluations' mean returns, and fits 80 columns.
-    """
+    """A line of progress, from the step on at which the run starts or resumes."""
 
     def __init__(self, steps: int, name: str):
         self._steps = steps
@@ -98,15 +95,9 @@ class Bar:
             )
         is_final = self._progress.n < self._steps <= step
         self._progress.update(min(step, self._steps) - self._progress.n)
-        shown = "final ones under way" if is_final else self._course(history.means)
+        last = rounded(history.means[-1])[0] if history.means else "-"
+        shown = "final ones under way" if is_final else last
         self._progress.set_postfix(returns=shown, refresh=is_final)
-
-    def _course(self, means: Sequence[float]) -> str:
-        """The last mean return, after a curve of all where there are Unicode's blocks."""
-        if not means:
-            return "-"
-        curve = "" if getattr(self._progress, "ascii", True) else sparkline(means, _CURVE)
-        return f"{curve} {rounded(means[-1])[0]}".strip()
 
     def close(self) -> None:
         """End the line."""

@@ -366,8 +366,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
 
 def read_study(path: Path) -> Study:
     """A study from its TOML file."""
-    if not exists(path):
-        raise InputError(f"no study at {path}: it must be a TOML file")
     given = read_toml(path)
     try:
         if "learners" in given:  # which files of jbrep have beside names

@@ -1,31 +1,19 @@
-"""What a study would do: the runs to go, each estimated from a short trial, and what they need."""
+"""What a study would do: the runs to go, each estimated from a short trial."""
 
 import heapq
-from collections.abc import Iterable, Iterator
-from pathlib import Path
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from jbrep.encoders import FULL
-from jbrep.encoders.encoder import SUFFIX
 from jbrep.envs.names import is_code
 from jbrep.progress import Progress
-from jbrep.records.storage import exists
 from jbrep.rl import Run
 from jbrep.rl.run import estimate
 from jbrep.stats.power import Prospect, prospects
-from jbrep.studies.config import data_key
 from jbrep.studies.plan import Cell, Plan
-from jbrep.studies.prepare import by_name, check, every_made
+from jbrep.studies.prepare import check
 from jbrep.studies.representations import ByCode
 from jbrep.studies.runner import usual_workers
-
-
-class MadeFirst(NamedTuple):
-    """Data sets of a name, or encoders of a representation."""
-
-    what: str
-    to_go: int
-    done: int
 
 
 class Forecast(NamedTuple):
@@ -36,16 +24,10 @@ class Forecast(NamedTuple):
     elapsed: float  # with so many workers [s]
     workers: int
     prospects: list[Prospect]  # of its claims
-    made_first: list[MadeFirst]  # data, each followed by the encoders that are made from them
 
 
 def forecast(plan: Plan, workers: int | None = None) -> Forecast:
-    """The runs to go, and how long they would take, estimated from a few steps of each learner.
-
-    Args:
-        plan: the study.
-        workers: how many processes would go on at a time; by default as many as are usual.
-    """
+    """The runs to go, and how long they would take, estimated from a few steps of each learner."""
     check(plan)
     plan.check_folder()
     workers, cells = workers or usual_workers(plan), plan.unfinished
@@ -63,7 +45,6 @@ def forecast(plan: Plan, workers: int | None = None) -> Forecast:
         elapsed=until_done(each, workers),
         workers=workers,
         prospects=list(prospects(plan.study.planned, plan.study.units)),
-        made_first=list(made_first(plan)),
     )
 
 
@@ -84,25 +65,3 @@ def _kind(cell: Cell) -> tuple[object, ...]:
 def _example(run: Run) -> Run:
     """A run that takes as long; an encoder that is no code need not exist yet, and costs little."""
     return run if is_code(run.encoder) else run.replace(encoder=FULL)
-
-
-def made_first(plan: Plan) -> Iterator[MadeFirst]:
-    """What is made before the runs."""
-    for name, data in plan.study.named_data.items():
-        if not data.folder:
-            sets = [each.is_complete for each in every_made(plan) if each.name == name]
-            yield MadeFirst(data_key(name), sets.count(False), sets.count(True))
-        for each in by_name(plan):
-            if plan.study.data_of(each) == name:
-                encoders = [
-                    _is_trained(plan.encoders(task) / f"{encoder}{SUFFIX}")
-                    for task in plan.study.tasks
-                    for encoder, _ in each.fits
-                ]
-                yield MadeFirst(each.name, encoders.count(False), encoders.count(True))
-
-
-def _is_trained(encoder: Path) -> bool:
-    """Whether an encoder's file is there, and no checkpoint of its training."""
-    checkpoint = encoder.with_suffix(".training") / "checkpoint.safetensors"
-    return exists(encoder) and not exists(checkpoint)

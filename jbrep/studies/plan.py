@@ -32,7 +32,7 @@ from jbrep.training.trainer import get_device
 
 STUDY = "study.json"
 REGISTRATION = "registration.json"
-PROGRESS = "progress"  # of a run under way: its steps, and the mean return of its last evaluation
+PROGRESS = "progress"  # of a run under way: its steps
 _SEAL = "sha256"
 _GRID = (  # may change
     "tasks",
@@ -255,12 +255,11 @@ class Plan:
         """A run's folder."""
         return self.folder / "runs" / cell.name
 
-    def progress(self, cell: Cell) -> tuple[int, str]:
-        """The steps that a run has done, and the mean return of its last evaluation as text."""
+    def progress(self, cell: Cell) -> int:
+        """The steps that a run has done."""
         with suppress(InputError, ValueError):
-            step, mean = read_file(self.folder_of(cell) / PROGRESS).decode().split()
-            return int(step), mean
-        return 0, "-"
+            return int(read_file(self.folder_of(cell) / PROGRESS))
+        return 0
 
     @property
     def unfinished(self) -> list[Cell]:

@@ -3,15 +3,14 @@
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from jbrep.collecting import collect
 from jbrep.collecting.collector import usual_shard_episodes
-from jbrep.collecting.derive import derive
-from jbrep.collecting.policies import Policy, acts_on_observations
+from jbrep.collecting.policies import Policy
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
@@ -20,7 +19,6 @@ from jbrep.encoders.shipped import UNLEARNED, find, names
 from jbrep.envs.names import import_modules, imported_modules, is_code
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
-from jbrep.jitterbug.tasks import TASKS
 from jbrep.machine import cores
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method
@@ -194,36 +192,13 @@ class Made:
         )
         return settings, policy
 
-    def source(self) -> "Made | None":
-        """What it is derived from; None where it is collected or exists.
-
-        The Jitterbug's tasks share their motion, unless the policy acts on what it observes.
-        """
-        if self.task not in TASKS or self.data.folder:
-            return None
-        if acts_on_observations(self.policy().settings()):
-            return None
-        first = next(name for name in self.plan.study.tasks if name in TASKS)
-        sources = (replace(self, task=name) for name in TASKS)
-        collected = next((each for each in sources if each.has_states), replace(self, task=first))
-        return None if collected == self else collected
-
-    @property
-    def has_states(self) -> bool:
-        """Whether it is there, at least in part, with the states of the simulation."""
-        manifest = self.folder / MANIFEST
-        return exists(manifest) and read_manifest(self.folder).settings.store_state
-
-    def make(self, source: "Made | None", threads: int | None) -> None:
-        """Collect or derive it on some threads, and train its encoders; None takes every core."""
+    def make(self, threads: int | None) -> None:
+        """Collect it on some threads, and train its encoders; None takes every core."""
         if not self.is_complete:
-            if source:
-                derive(source.folder, self.task, self.folder, num_threads=threads)
-            else:
-                settings, policy = self.to_collect()
-                episodes = usual_shard_episodes(settings, self.folder, policy)
-                settings = settings.replace(shard_episodes=episodes)
-                collect(settings, self.folder, num_threads=threads, policy=policy)
+            settings, policy = self.to_collect()
+            episodes = usual_shard_episodes(settings, self.folder, policy)
+            settings = settings.replace(shard_episodes=episodes)
+            collect(settings, self.folder, num_threads=threads, policy=policy)
             say(f"{self}: {read_manifest(self.folder).rows:,} states")
         fitter = self.fitter()
         for name, kind, given in self.fits():
@@ -268,29 +243,16 @@ def prepare(plan: Plan, workers: int = 1) -> None:
         plan: the study.
         workers: how many processes go on at a time.
     """
-    sources = {each: each.source() for each in every_made(plan)}
-    waiting = [each for each in sources if not each.is_made]
-    waiting.sort(key=lambda each: sources[each] is not None)  # what others are derived from first
+    waiting = [each for each in every_made(plan) if not each.is_made]
     workers = min(workers, cores(), len(waiting))
     if workers < 2:
         for each in waiting:
-            each.make(sources[each], None)
+            each.make(None)
         return
-    under_way = set[Made]()
-
-    def next_job() -> tuple[Made, Made | None] | None:
-        missing = under_way.union(waiting)
-        for each in waiting:
-            if sources[each] not in missing:
-                waiting.remove(each)
-                under_way.add(each)
-                return each, sources[each]
-        return None
-
+    jobs = iter(waiting)
     make = partial(_make, max(1, cores() // workers), imported_modules())
-    with closing(side_by_side(make, next_job, workers)) as made:
-        for (each, _), mistake in made:
-            under_way.remove(each)
+    with closing(side_by_side(make, lambda: next(jobs, None), workers)) as made:
+        for each, mistake in made:
             if mistake:
                 raise InputError(mistake)
             if mistake is None:
@@ -300,12 +262,11 @@ def prepare(plan: Plan, workers: int = 1) -> None:
                 )
 
 
-def _make(threads: int, modules: Iterable[str], job: tuple[Made, Made | None]) -> str:
+def _make(threads: int, modules: Iterable[str], made: Made) -> str:
     """Make a data set and its encoders, in a worker; what a user did wrong."""
-    made, source = job
     try:
         import_modules(modules)
-        made.make(source, threads)
+        made.make(threads)
         return ""
     except InputError as error:
         return str(error)

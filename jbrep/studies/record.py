@@ -223,7 +223,7 @@ class RunsRecord(Document, frozen=True, kw_only=True):
         return cls(
             study=plan.study if plan else None,
             registration=_registered(plan, runs) if plan else None,
-            missing={cell.name: plan.progress(cell)[0] for cell in plan.unfinished} if plan else {},
+            missing={cell.name: plan.progress(cell) for cell in plan.unfinished} if plan else {},
             tables={},
             versions=[*{frozenset(each.items()): dict(each) for each in versions}.values()],
             processors=[*dict.fromkeys(run.cpu for run in runs)],

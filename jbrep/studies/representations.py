@@ -23,7 +23,6 @@ Given = str | dict[str, Any]  # a representation in a study's file: a name or a 
 
 MAX_ENCODERS = 1000  # of one representation
 _TASK, _SEED, _ENCODER = "{task}", "{seed}", "{encoder}"  # in a file's path, see ByFile
-_Path = Annotated[str, Meta(min_length=1)]
 _OwnName = Annotated[
     str,
     pattern(
@@ -114,51 +113,33 @@ class ByFile(Representation, frozen=True, kw_only=True):
     """An encoder of the user's in a file.
 
     A path may contain {task}, the task's name as in folders, and either {seed}, a run's seed, or
-    {encoder}, the number of the run's encoder. It may be a folder, which then holds
-    TASK/NAME.safetensors or NAME.safetensors. Relative ones begin at the working directory.
+    {encoder}, the number of the run's encoder. Relative ones begin at the working directory.
 
     Attributes:
-        file: its path, or a path for each task.
+        file: its path.
     """
 
-    file: _Path | dict[str, _Path]
+    file: Annotated[str, Meta(min_length=1)]
 
     def check(self) -> None:
-        for path in self._paths:
-            words = set(re.findall(r"\{.*?\}", path))
-            if _ENCODER in words and not self.encoders:
-                raise InputError(f"say how many files {path} stands for, such as encoders = 5")
-            known = (_TASK, _ENCODER if self.encoders else _SEED)
-            if unknown := words - {*known}:
-                raise InputError(
-                    f"unknown {min(unknown)} in its file {path}: only {' and '.join(known)} are "
-                    "known"
-                )
-            if self.encoders and _ENCODER not in words:
-                raise InputError(f"its file {path} must contain {_ENCODER}, as there are several")
-        with_seed = [path for path in self._paths if _SEED in path]
-        if without := {*self._paths} - {*with_seed} if with_seed else ():
-            raise InputError(f"its file {min(without)} must contain {_SEED}, as others do")
-
-    @property
-    def _paths(self) -> Iterable[str]:
-        return (self.file,) if isinstance(self.file, str) else self.file.values()
+        path, words = self.file, set(re.findall(r"\{.*?\}", self.file))
+        if _ENCODER in words and not self.encoders:
+            raise InputError(f"say how many files {path} stands for, such as encoders = 5")
+        known = (_TASK, _ENCODER if self.encoders else _SEED)
+        if unknown := words - {*known}:
+            raise InputError(
+                f"unknown {min(unknown)} in its file {path}: only {' and '.join(known)} are known"
+            )
+        if self.encoders and _ENCODER not in words:
+            raise InputError(f"its file {path} must contain {_ENCODER}, as there are several")
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
-        pattern = self.file if isinstance(self.file, str) else self.file.get(task)
-        if pattern is None:
-            raise InputError(f"representation {self.name} has no file for {task}")
-        filled = pattern.replace(_TASK, slug(task)).replace(_SEED, str(seed))
+        filled = self.file.replace(_TASK, slug(task)).replace(_SEED, str(seed))
         filled = filled.replace(_ENCODER, str(self.encoder_seed(seed)))
-        path = Path(filled).absolute()  # workers may have another working directory
-        if not path.is_dir():
-            return str(path)
-        name = f"{self.name}{SUFFIX}"
-        of_task = path / slug(task) / name
-        return str(of_task if of_task.exists() else path / name)
+        return str(Path(filled).absolute())  # workers may have another working directory
 
     def encoder_seed(self, seed: int) -> int | None:
-        return seed if any(_SEED in path for path in self._paths) else super().encoder_seed(seed)
+        return seed if _SEED in self.file else super().encoder_seed(seed)
 
 
 class ByCode(Representation, frozen=True, kw_only=True):

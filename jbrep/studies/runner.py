@@ -1,18 +1,12 @@
 """A study from start to end: its runs side by side, on this machine or on a Ray cluster."""
 
-import sys
 import time
 import traceback
-from collections import Counter
 from collections.abc import Callable, Generator, Iterable
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
-
-from rich.console import Console
-from rich.live import Live
-from rich.table import Table
 
 from jbrep.envs.names import import_modules, imported_modules
 from jbrep.errors import first_line
@@ -20,7 +14,7 @@ from jbrep.machine import cores
 from jbrep.pool import ATTEMPTS, on_cluster, side_by_side, stop_requested
 from jbrep.records.storage import exclusive, exists, make_folder, write_note
 from jbrep.rl import Session, StoppedError, train
-from jbrep.rl.files import FAILED, FINISHED, read_run, runs_below
+from jbrep.rl.files import runs_below
 from jbrep.rl.history import History
 from jbrep.rl.settings import CPU, CUDA
 from jbrep.rl.training import drop_checkpoint, standing_of
@@ -37,7 +31,6 @@ from jbrep.studies.plan import (
 )
 from jbrep.studies.prepare import check, policies, prepare, say
 from jbrep.studies.tables import REFERENCE_RETURNS, play_references, write_tables
-from jbrep.text import duration, rounded
 
 ERROR = "error.txt"  # the traceback of a run that crashed
 CRASHED = "crashed"
@@ -94,8 +87,7 @@ class _ProgressFile:
     def __call__(self, history: History, step: int) -> None:
         now = time.monotonic()
         if step >= self._steps or now - self._written >= _WRITE_EVERY:
-            shown = rounded(history.means[-1])[0] if history.evaluations else "-"
-            write_note(self._path, f"{step} {shown}")
+            write_note(self._path, str(step))
             self._written = now
 
 
@@ -115,16 +107,13 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
     """
     jobs = map(plan.assigned, cells)
     train = partial(work, modules=imported_modules())
-    ended = side_by_side(
-        train, lambda: next(jobs, None), workers, _PATIENCE, stopping=_announce_stop
+    told = partial(
+        say, "stopping: the runs under way write their checkpoints; Ctrl-C again ends all"
     )
+    ended = side_by_side(train, lambda: next(jobs, None), workers, _PATIENCE, told)
     with closing(ended):
         for job, outcome in ended:
             yield outcome or _killed(job.name)
-
-
-def _announce_stop() -> None:
-    say("stopping: the runs under way write their checkpoints; Ctrl-C again ends them at once")
 
 
 def _killed(name: str) -> Outcome:
@@ -173,11 +162,6 @@ def run_study(
     A study with claims is registered first: beside its file, in a commit, where git has that file.
     At last the policies play that agents are compared with.
 
-    Args:
-        plan: the study.
-        backend: what runs it.
-        workers: how many processes go on at a time; by default as many as are usual.
-
     Returns:
         How many runs crashed.
     """
@@ -196,15 +180,16 @@ def run_study(
             if standing_of(plan.run(cell), plan.folder_of(cell)).ended:
                 drop_checkpoint(plan.folder_of(cell))  # it was killed at the very end
         plan.write()  # not before: a study that is refused changes nothing
-        progress = Progress(plan, unfinished)
+        crashed, done = 0, len(plan.cells) - len(unfinished)
         if unfinished:
-            with progress.live, closing(backend(plan, unfinished, workers)) as outcomes:
-                for outcome in outcomes:
-                    progress.report(outcome)
+            with closing(backend(plan, unfinished, workers)) as outcomes:
+                for number, each in enumerate(outcomes, done + 1):
+                    say(f"{number}/{len(plan.cells)} {each.name} {each.status}: {each.message}")
+                    crashed += each.status == CRASHED
         if runs_below(plan.folder):
             write_tables(plan.folder)
             play_references(plan.folder)
-    return progress.counts[CRASHED]
+    return crashed
 
 
 def register_study(plan: Plan) -> Path:
@@ -226,64 +211,3 @@ def register_study(plan: Plan) -> Path:
         plan.check_new()
         plan.to_register(policies(plan)).write(path)
     return path
-
-
-class Progress:
-    """A line for each run that ends; on a terminal also a live table of the runs under way.
-
-    Args:
-        plan: the study.
-        unfinished: the runs to go.
-
-    Attributes:
-        live: a context that shows the table.
-        counts: how many runs have ended, by status.
-    """
-
-    def __init__(self, plan: Plan, unfinished: Iterable[Cell]):
-        self._plan, self._unfinished = plan, {cell.name: cell for cell in unfinished}
-        ended = [cell for cell in plan.cells if cell.name not in self._unfinished]
-        self.counts = Counter[str](read_run(plan.folder_of(cell)).status for cell in ended)
-        self._start, self._steps_before = time.monotonic(), self._steps()
-        self.live: AbstractContextManager[object] = nullcontext()
-        if sys.stderr is not None and sys.stderr.isatty():
-            console = Console(stderr=True)
-            self.live = Live(
-                console=console, get_renderable=self._table, refresh_per_second=1, transient=True
-            )
-
-    def report(self, outcome: Outcome) -> None:
-        """Count a run that has ended, and print a line."""
-        del self._unfinished[outcome.name]
-        self.counts[outcome.status] += 1
-        total = len(self._plan.cells)
-        number = total - len(self._unfinished)
-        say(f"{number}/{total} {outcome.name} {outcome.status}: {outcome.message}")
-
-    def _table(self) -> Table:
-        table = Table("running", box=None, pad_edge=False)
-        for name in ("steps", "last evaluation"):
-            table.add_column(name, justify="right")
-        steps = self._plan.study.steps
-        for cell in list(self._unfinished.values()):
-            step, mean = self._plan.progress(cell)
-            last = mean if step < steps else "final ones under way"
-            if step:
-                table.add_row(cell.name, f"{step:,} of {steps:,}", last)
-        table.caption = self._summary()
-        return table
-
-    def _summary(self) -> str:
-        counts = [f"{self.counts[status]} {status}" for status in (FINISHED, FAILED, CRASHED)]
-        to_go = len(self._plan.cells) * self._plan.study.steps - (steps := self._steps())
-        left, done = "-", steps - self._steps_before
-        if done > 0:
-            left = duration((time.monotonic() - self._start) / done * to_go)
-        return ", ".join([*counts, f"{len(self._unfinished)} to go, {left} left"])
-
-    def _steps(self) -> int:
-        """Steps that all runs have done, those that have ended all of theirs."""
-        unfinished = list(self._unfinished.values())
-        ended = len(self._plan.cells) - len(unfinished)
-        under_way = sum(self._plan.progress(cell)[0] for cell in unfinished)
-        return ended * self._plan.study.steps + under_way

@@ -174,13 +174,6 @@ def _lasting(folder: Path, tasks: Mapping[str, Task]) -> Iterator[tuple[str, str
             yield name, sha256
 
 
-def read_curves(folder: Path) -> list[RunCurve]:
-    """The runs below a folder that have finished or failed, as they are in no table yet."""
-    ended = _ended(folder)
-    returns = [Return(*row) for row in _of_runs(ended, read_evaluations)]
-    return Tables(RunsRecord.of(folder, ended), returns, [], {}).curves()
-
-
 def _ended(folder: Path) -> dict[Path, RunRecord]:
     """The runs that have ended, by folder."""
     folders = runs_below(folder)

@@ -204,35 +204,6 @@ class Free(Sledge):
     action_space = spaces.Box(-np.inf, np.inf, (3,))
 
 
-class Drawn(Sledge):
-    """A sledge that draws itself, as a red bar on a rail of white, 90 by 60 pixels.
-
-    Args:
-        broken: its `render()` gives nothing.
-        render_mode: as Gymnasium's.
-    """
-
-    dt = None
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
-
-    def __init__(self, broken=False, render_mode=None):
-        super().__init__()
-        self.broken, self.render_mode = broken, render_mode
-
-    def render(self):
-        if self.broken or self.render_mode != "rgb_array":
-            return None
-        picture = np.full((60, 90, 3), 255, np.uint8)
-        at = self.pixel(self.state[0])
-        picture[:, at - 2 : at + 3] = (200, 0, 0)
-        return picture
-
-    @staticmethod
-    def pixel(place):
-        """The column in which a place [m] is drawn."""
-        return int(45 + 40 * np.clip(place, -1, 1))
-
-
 class Filmed(Sledge):
     """A sledge that is observed by a camera."""
 
@@ -256,7 +227,6 @@ for _name, _made, _limit in (
     ("Told", Told, LIMIT),
     ("Scored", Scored, LIMIT),
     ("Free", Free, LIMIT),
-    ("Drawn", Drawn, LIMIT),
     ("Filmed", Filmed, LIMIT),
     ("Endless", Sledge, None),
 ):

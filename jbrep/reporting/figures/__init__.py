@@ -1,7 +1,6 @@
 """Figures, drawn from the tables that the other stages write."""
 
-from jbrep.reporting.figures.encoders import encoder_plots
 from jbrep.reporting.figures.panels import Plot, write
 from jbrep.reporting.figures.study import study_plots
 
-__all__ = ["Plot", "encoder_plots", "study_plots", "write"]
+__all__ = ["Plot", "study_plots", "write"]

@@ -307,14 +307,9 @@ def fitting(
 
 
 def tilt(axes: Axes, _: object = None) -> None:
-    """Turn the names of columns that don't fit beside each other; the figure grows by them."""
-    names = [label.get_text() for label in axes.get_xticklabels()]
-    longest, figure = max(map(len, names)), axes.figure
-    assert isinstance(figure, Figure)
-    if len(names) > 3 or len(names) * longest > 60:
-        angle, side, share = (30, "right", 0.03) if len(names) <= 12 else (90, "center", 0.06)
-        axes.set_xticks(axes.get_xticks(), names, rotation=angle, ha=side)
-        figure.set_figheight(figure.get_figheight() + share * longest / 2)
+    """Turn the names of columns, if they are many."""
+    if len(axes.get_xticks()) > 3:
+        axes.tick_params(axis="x", labelrotation=45)
 
 
 def legend_below(figure: Figure, grid: Iterable[Axes]) -> None:
