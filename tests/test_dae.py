@@ -11,7 +11,6 @@ from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.training.network import ARCHITECTURES, layers, stacks
 from jbrep.training.trainer import Schedule, Trainer
-from jbrep.training.windows import POOL, RUN, shuffled
 
 
 def rows(count=600, size=16, seed=0):
@@ -21,13 +20,13 @@ def rows(count=600, size=16, seed=0):
     return torch.from_numpy((random.normal(size=(count, 4)) @ plane).astype(np.float32))
 
 
-def trainer(train=None, latent=4, architecture="paper", noise=0.1, seed=0, pool=POOL, **how):
+def trainer(train=None, latent=4, architecture="paper", noise=0.1, seed=0, **how):
     train = rows() if train is None else train
     method = DAE(latent=latent, architecture=architecture, seed=seed)
     objective = Reconstruction(method, train.shape[1], noise=noise)
     schedule = {"epochs": 3, "batch_size": 100, "learning_rate": 3e-3, "seed": seed, **how}
     windows, watched = TensorWindows(train), TensorWindows(train[:50])
-    return Trainer(objective, Schedule(**schedule), windows, watched, pool)
+    return Trainer(objective, Schedule(**schedule), windows, watched)
 
 
 def trained(**changes):
@@ -88,23 +87,6 @@ def test_every_row_comes_once_with_noise_of_its_own():
     assert abs(np.corrcoef(noise[:-1].ravel(), noise[1:].ravel())[0, 1]) < 0.02  # samples
     assert len(np.unique(noise.round(6))) > 25_000
     assert abs(np.corrcoef(noise[:, 0], clean[:, 0])[0, 1]) < 0.1
-
-
-def test_more_rows_come_in_pools_of_shuffled_runs():
-    order = shuffled(10 * RUN, 4 * RUN + 100, torch.Generator().manual_seed(0))
-    pools = [sorted({*(rows // RUN).tolist()}) for rows in order.split(4 * RUN)]
-    assert [len(runs) for runs in pools] == [4, 4, 2]
-    assert pools[0] != [0, 1, 2, 3]
-    assert (order.diff() == 1).float().mean() < 0.01  # shuffled within a pool, too
-    again, other = (shuffled(10 * RUN, 4 * RUN, torch.Generator().manual_seed(s)) for s in (0, 1))
-    assert torch.equal(order, again)
-    assert not torch.equal(order, other)
-
-
-@pytest.mark.parametrize("count", [10 * RUN, 10 * RUN + 1, 11 * RUN - 1])
-def test_pools_have_every_row_once(count):
-    order = shuffled(count, 4 * RUN, torch.Generator().manual_seed(0))
-    assert torch.equal(order.sort().values, torch.arange(count))
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)

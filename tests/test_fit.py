@@ -9,7 +9,6 @@ from pkgutil import iter_modules
 
 import numpy as np
 import pytest
-import torch
 from command import jbrep, start, wait_for
 from small import write_again
 from tensors import torch_threads
@@ -17,7 +16,6 @@ from threadpoolctl import threadpool_limits
 from wide import wide
 
 from jbrep import methods
-from jbrep.dae import DAE
 from jbrep.dataset import Dataset, ScaledDataset, from_arrays
 from jbrep.encoders import load
 from jbrep.errors import InputError
@@ -28,8 +26,6 @@ from jbrep.methods.linear import lost, ratio_to_pca
 from jbrep.methods.registry import METHODS, read_name
 from jbrep.records.storage import exclusive
 from jbrep.training.method import USUAL
-from jbrep.training.trainer import Schedule, Trainer
-from jbrep.training.windows import Windows
 
 RECONSTRUCTING = ("full", "pca", "dae")
 
@@ -130,35 +126,6 @@ def test_only_one_may_train_it(data, tmp_path):
         with alone, pytest.raises(InputError, match="is being written by process"):
             fitter.fit(kind, **given)
         assert fitter.fit(kind, **given).is_new
-
-
-def pooled(data, memory, pool, **how):
-    """A trainer of a dae that shuffles the data in pools far smaller than they are."""
-    objective = DAE(latent=4).objective(data)
-    windows = Windows(data, data.train, memory=memory)
-    watched = Windows(data, data.test, memory=0, most=9)
-    return Trainer(objective, Schedule(learning_rate=5e-4, **how), windows, watched, pool)
-
-
-def trained(data, memory, epochs, path=None):
-    """A trainer that is done, perhaps from a checkpoint."""
-    trainer = pooled(data, memory, 1 << 20, batch_size=256, epochs=epochs)
-    if path:
-        trainer.restore({}, path)
-    list(trainer.epochs())
-    return trainer
-
-
-def test_a_training_from_disk_is_that_from_memory_and_resumes_in_either(tmp_path):
-    data = wide([700] * 8, features=40, folder=tmp_path)
-    memory, disk = (trained(data, limit, epochs=2) for limit in (1 << 30, 1 << 18))
-    assert memory.history == disk.history
-    for limit in (1 << 30, 1 << 18):
-        trained(data, limit, epochs=1).save({}, tmp_path / "at")
-        for other in (1 << 30, 1 << 18):
-            resumed = trained(data, other, 2, tmp_path / "at")
-            for name, parameter in memory.objective.state_dict().items():
-                assert torch.equal(resumed.objective.state_dict()[name], parameter)
 
 
 @pytest.mark.parametrize("kind", RECONSTRUCTING)

@@ -1,4 +1,4 @@
-"""Windows of steps: within episodes, without copies; training on them, from disk and resumed."""
+"""Windows of steps: within episodes, without copies; training on them, resumed."""
 
 import numpy as np
 import pytest
@@ -31,9 +31,9 @@ def within(data, horizon):
     return [row for row in data.train if row + horizon < ends[np.sum(ends <= row)]]
 
 
-@pytest.mark.parametrize(("horizon", "memory"), [(0, 0), (0, 1 << 30), (6, 0), (20, 1 << 30)])
-def test_windows_lie_within_episodes_and_have_the_data_sets_numbers(data, horizon, memory):
-    windows = Windows(data, data.train, horizon, memory=memory)
+@pytest.mark.parametrize("horizon", [0, 6, 20])
+def test_windows_lie_within_episodes_and_have_the_data_sets_numbers(data, horizon):
+    windows = Windows(data, data.train, horizon)
     first = np.array(within(data, horizon))
     assert len(windows) == len(first)
     order = np.random.default_rng(0).permutation(len(first))
@@ -49,15 +49,6 @@ def test_windows_lie_within_episodes_and_have_the_data_sets_numbers(data, horizo
         mean = data.rewards(steps).mean(axis=1, dtype=float)
         assert np.ptp(arrays["reward"][steps].mean(axis=1) / mean) < 1e-4  # in another unit
         np.testing.assert_allclose(windows.rewards(numbers, horizon), mean, atol=1e-6)
-
-
-def test_rows_and_actions_share_the_memory(data):
-    """Each gets its part, as both are there at once."""
-    numbers = len(data.train) * (data.size + data.task.action_size)
-    for memory, is_held in ((4 * numbers, True), (4 * numbers - 1, False)):
-        windows = Windows(data, data.train, 1, memory=memory)
-        held = [isinstance(each, torch.Tensor) for each in (windows._scaled, windows._action)]
-        assert all(held) == is_held
 
 
 def test_a_pass_in_blocks_has_the_same_windows(data, monkeypatch):
@@ -78,12 +69,10 @@ def test_a_horizon_that_no_episode_has_is_refused(data):
             look()
 
 
-def test_forward_is_the_same_from_disk_stopped_and_on_more_threads(
-    collected, tmp_path, monkeypatch
-):
+def test_forward_is_the_same_stopped_and_on_more_threads(collected, tmp_path, monkeypatch):
     data = ScaledDataset(Dataset(collected))
     how = {"latent": 4, "architecture": "linear", "horizons": "1,5", "epochs": 3, "batch_size": 500}
-    whole = Fitter(data, tmp_path / "memory").fit("forward", **how).path.read_bytes()
+    whole = Fitter(data, tmp_path / "whole").fit("forward", **how).path.read_bytes()
     save, saved = Trainer.save, []
 
     def stopping(*given):
@@ -93,7 +82,7 @@ def test_forward_is_the_same_from_disk_stopped_and_on_more_threads(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(Trainer, "save", stopping)
-    fitter = Fitter(data, tmp_path / "disk", memory=0)
+    fitter = Fitter(data, tmp_path / "stopped")
     with pytest.raises(KeyboardInterrupt):
         fitter.fit("forward", **how)
     with torch_threads(2):

@@ -84,21 +84,14 @@ class Fitter:
 
     The encoder `dae-8` is the file `dae-8.safetensors` there; the folder `dae-8.training` beside it
     has TensorBoard's scalars and, until training is finished, the checkpoint to resume from.
-    `memory` is bytes that training rows may take, by default half of what is free: more are read
-    from disk in each epoch, to the same file.
     """
 
     def __init__(
-        self,
-        data: ScaledDataset | Dataset | str | Path,
-        folder: Path,
-        device: str = "auto",
-        memory: int | None = None,
+        self, data: ScaledDataset | Dataset | str | Path, folder: Path, device: str = "auto"
     ):
         self._data = ScaledDataset.of(data)
         self._folder = folder
         self._device = get_device(device)
-        self._memory = memory
         self._scaled: dict[Any, ScaledDataset] = {}
         self._windows: dict[tuple[ScaledDataset, int], tuple[Windows, Windows]] = {}
 
@@ -189,7 +182,7 @@ class Fitter:
     def _windows_of(self, data: ScaledDataset, horizon: int) -> tuple[Windows, Windows]:
         key = data, horizon
         if key not in self._windows:
-            train = Windows(data, data.train, horizon, self._device, self._memory)
+            train = Windows(data, data.train, horizon, self._device)
             self._windows = {key: (train, watched_windows(data, horizon, self._device))}
         return self._windows[key]
 

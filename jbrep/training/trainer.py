@@ -18,7 +18,7 @@ from jbrep.errors import InputError, differences
 from jbrep.records import container
 from jbrep.records.record import Finite, Record, from_plain, to_plain
 from jbrep.training.objective import Objective
-from jbrep.training.windows import POOL, Windows, shuffled
+from jbrep.training.windows import Windows
 
 if TYPE_CHECKING:
     from jbrep.training.method import Learned
@@ -77,7 +77,7 @@ class Trainer:
 
     An epoch's order and noise depend on the seed and the epoch's number alone, so that a resumed
     training gives the same weights as one that was never stopped. The loss on `watched` windows is
-    reported; `pool` is bytes of rows that are shuffled together.
+    reported.
 
     Attributes:
         objective, optimiser: after the last epoch.
@@ -92,11 +92,9 @@ class Trainer:
         schedule: "Schedule | Learned",
         windows: Windows,
         watched: Windows,
-        pool: int = POOL,
     ):
         self.objective, self.schedule = objective, schedule
         self._windows = windows
-        self._pool = pool // (windows.size * torch.float32.itemsize)  # rows
         count = len(windows)
         self._batch_size = min(schedule.batch_size or default_batch_size(count), count)
         self._batches_per_epoch = -(-count // self._batch_size)
@@ -191,7 +189,7 @@ class Trainer:
     def _draws(self, number: int) -> Iterator[list[Any]]:
         words = np.random.SeedSequence((self.schedule.seed, number)).generate_state(1, np.uint64)
         generator = torch.Generator(self._windows.device).manual_seed(int(words[0]))
-        order = shuffled(len(self._windows), self._pool, generator)
+        order = torch.randperm(len(self._windows), generator=generator, device=self._windows.device)
         for numbers in order.split(_DRAWN_AT_ONCE * self._batch_size):
             drawn = self.objective.draws(self._windows, numbers, self._batch_size, generator)
             yield list(drawn)

@@ -1,9 +1,5 @@
-"""Windows of consecutive steps, which never cross the end of an episode, and their rows.
+"""Windows of consecutive steps, which never cross the end of an episode, and their rows."""
 
-Rows are in memory or on disk, and in both cases in the same order in an epoch.
-"""
-
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -14,14 +10,8 @@ from torch import Tensor
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.errors import InputError
-from jbrep.machine import free_memory
 from jbrep.text import counted
 
-Load = Callable[[NDArray[np.int64]], NDArray[np.float32]]
-
-_LEAST_MEMORY = 1 << 30  # bytes that rows may take on any machine
-POOL = 1 << 30  # bytes of rows that are shuffled together
-RUN = 1024  # consecutive rows that come into a pool together
 _WATCHED = 100_000  # held-out windows whose loss is reported after each epoch
 _WATCHED_NUMBERS = 1 << 22  # at most in their rows: 16 MiB
 
@@ -29,15 +19,14 @@ _WATCHED_NUMBERS = 1 << 22  # at most in their rows: 16 MiB
 class Windows:
     """Windows of consecutive steps: a row, and some number of rows after it in its episode.
 
-    A window is a number: rows, actions and rewards are looked up when they are asked for, so that
-    windows take no more memory than the rows that they share.
+    A window is a number: rows, actions and rewards are looked up, so that windows take no more
+    memory than the rows that they share.
 
     Args:
         data: scaled.
         rows: sorted rows of whole episodes, such as `data.train`.
         horizon: rows after the first one.
-        device: where what is looked up will be.
-        memory: bytes that rows may take: more are read from disk when they are asked for.
+        device: where they are held.
         most: windows, at most; a sample of them if there are more.
     """
 
@@ -47,12 +36,10 @@ class Windows:
         rows: NDArray[np.int64],
         horizon: int = 0,
         device: torch.device | None = None,
-        memory: int | None = None,
         most: int | None = None,
     ):
         self._data, self._rows = data, rows
         self.device = device or torch.device("cpu")
-        self._memory = available_memory(self.device) if memory is None else memory
         starts = first_rows(data, rows, horizon)
         chosen = starts if most is None else sample(starts, most)
         every = len(chosen) == len(rows)
@@ -97,17 +84,12 @@ class Windows:
         return (total / count).float()
 
     @cached_property
-    def _scaled(self) -> "Tensor | _StoredRows":
-        return self._rows_of(self._data.load, self.size)
+    def _scaled(self) -> Tensor:
+        return torch.from_numpy(self._data.load(self._rows)).to(self.device)
 
     @cached_property
-    def _action(self) -> "Tensor | _StoredRows":
-        return self._rows_of(self._data.actions, self._data.task.action_size)
-
-    def _rows_of(self, load: Load, width: int) -> "Tensor | _StoredRows":
-        """Rows of so many numbers, in their share of the memory that rows and actions may take."""
-        memory = self._memory * width // (self.size + self._data.task.action_size)
-        return rows_of(load, self._rows, width, self.device, memory)
+    def _action(self) -> Tensor:
+        return torch.from_numpy(self._data.actions(self._rows)).to(self.device)
 
     @cached_property
     def _earned(self) -> Tensor:
@@ -146,61 +128,4 @@ def count_windows(data: ScaledDataset, horizon: int) -> int:
 def watched_windows(data: ScaledDataset, horizon: int, device: torch.device) -> Windows:
     """A sample of the held-out windows: at most 100,000, fewer of wide robots."""
     most = min(_WATCHED, _WATCHED_NUMBERS // data.size)
-    return Windows(data, data.test, horizon, device, memory=0, most=most)
-
-
-def available_memory(device: torch.device) -> int:
-    """Bytes that training rows may take: half of what is free, but at least 1 GiB.
-
-    Rows for a GPU pass through the machine's memory, so they must fit in half of both.
-    """
-    memory = max(free_memory() // 2, _LEAST_MEMORY)
-    if device.type == "cuda":
-        memory = min(memory, torch.cuda.mem_get_info(device)[0] // 2)
-    return memory
-
-
-def rows_of(
-    load: Load, rows: NDArray[np.int64], width: int, device: torch.device, memory: int
-) -> "Tensor | _StoredRows":
-    """What is loaded of the rows, (n, width), on that device, or left on disk if it doesn't fit.
-
-    Both give the same numbers in the same order, and so the same weights. What is read from disk
-    is left to the system's cache of files, which gives it up as soon as memory is needed.
-    """
-    if len(rows) * width * np.dtype(np.float32).itemsize <= memory:
-        return torch.from_numpy(load(rows)).to(device)
-    return _StoredRows(load, rows, device)
-
-
-class _StoredRows:
-    """Rows (n, d) that are read from the data set whenever some are asked for."""
-
-    def __init__(self, load: Load, rows: NDArray[np.int64], device: torch.device):
-        self._load, self._numbers, self._device = load, rows, device
-
-    def index_select(self, dim: int, index: Tensor, /) -> Tensor:
-        numbers, place = index.cpu().sort()  # a disk is faster in ascending order
-        loaded = torch.from_numpy(self._load(self._numbers[numbers.numpy()])).to(self._device)
-        return torch.empty_like(loaded).index_copy_(0, place.to(self._device), loaded)
-
-
-def shuffled(count: int, pool: int, generator: torch.Generator) -> Tensor:
-    """Every row number below `count` once, in an order that a disk can be read in.
-
-    Rows that make up one pool are permuted uniformly. More are taken in runs of consecutive rows:
-    the runs in random order, as many at a time as a pool holds, and their rows shuffled together,
-    so that what is read at a time is a pool, whatever the number of rows. The order depends on the
-    arguments alone, not on whether the rows are in memory.
-    """
-    device = generator.device
-    if count <= pool:
-        return torch.randperm(count, generator=generator, device=device)
-    runs = torch.randperm(-(-count // RUN), generator=generator, device=device)
-    within = torch.arange(RUN, device=device)
-    pools = []
-    for chosen in runs.split(max(1, pool // RUN)):
-        rows = (chosen[:, None] * RUN + within).flatten()
-        rows = rows[rows < count]  # the last run may be shorter
-        pools.append(rows[torch.randperm(len(rows), generator=generator, device=device)])
-    return torch.cat(pools)
+    return Windows(data, data.test, horizon, device, most)
