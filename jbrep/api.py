@@ -31,7 +31,7 @@ from jbrep.parameters import (
     Threads,
     Workers,
 )
-from jbrep.rl.settings import CLASSES, Seed, TrainingSettings
+from jbrep.rl.settings import Seed, TrainingSettings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -309,7 +309,7 @@ def train(
         StoppedError: `stop` was true.
     """
     from jbrep.envs.make import is_one_robot
-    from jbrep.rl.settings import MODERN
+    from jbrep.rl.presets import MODERN
 
     known = check_learner(task, algorithm, preset, encoder, begin_from)
     from jbrep.machine import cores
@@ -358,9 +358,9 @@ def check_learner(
     from jbrep.rl.files import read_finished
     from jbrep.rl.presets import get_preset, usual_preset
 
-    choose(algorithm, CLASSES, "algorithm")
-    if not preset.endswith(".toml"):
-        get_preset(preset or usual_preset(algorithm), algorithm)
+    base = preset or usual_preset(algorithm)
+    if not base.endswith(".toml"):
+        get_preset(base, algorithm)
     if begin_from:
         read_finished(Path(begin_from))
     known = as_task(task)

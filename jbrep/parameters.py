@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from msgspec import Meta
 
 from jbrep.errors import STEP_TIMEOUT, InputError
-from jbrep.rl.settings import CLASSES
+from jbrep.rl.presets import ALGORITHMS
 
 if TYPE_CHECKING:
     from jbrep.envs.task import Task
@@ -78,7 +78,7 @@ History = Annotated[
 Data = Annotated[str, Meta(description="A folder from jbrep collect.", extra={"metavar": "FOLDER"})]
 Out = Annotated[Path, Meta(description="A folder.")]
 NewFile = Annotated[Path, Meta(description="A new file.")]
-Algorithm = Annotated[str, Meta(description=f"One of {', '.join(CLASSES)}.")]
+Algorithm = Annotated[str, Meta(description=f"One of {', '.join(ALGORITHMS)}.")]
 Preset = Annotated[
     str,
     Meta(

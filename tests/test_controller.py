@@ -20,11 +20,11 @@ from jbrep.rl.controller import Controller, load_policy
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.policy import build
 from jbrep.rl.policy_file import find_shipped
-from jbrep.rl.settings import CLASSES
+from jbrep.rl.presets import ALGORITHMS
 
 TASK = describe("move_to_pose", max_episode_steps=200)
 SETTINGS = {
-    **{name: {"net_arch": [24, 16]} for name in CLASSES},
+    **{name: {"net_arch": [24, 16]} for name in ALGORITHMS},
     "td3": {"net_arch": [24], "activation_fn": "leaky_relu", "action_repeat": 3},
     "ppo": {"net_arch": [24, 16], "activation_fn": "tanh", "normalize": True},
     "a2c": {"net_arch": [], "normalize": True},
@@ -72,7 +72,7 @@ def difference_over_an_episode(trained, controller, steps=200):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "encoder"), [*zip(CLASSES, cycle(("full", "symmetry", "dae-8")), strict=False)]
+    ("algorithm", "encoder"), [*zip(ALGORITHMS, cycle(("full", "symmetry", "dae-8")), strict=False)]
 )
 def test_a_controller_acts_as_its_run(algorithm, encoder):
     trained = randomised(algorithm, encoder)

@@ -29,7 +29,7 @@ from jbrep.rl.agent import evaluate, make_agent, make_env, training_seed
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, POLICY, read_evaluations, read_run
 from jbrep.rl.history import Bar, History
 from jbrep.rl.policy import load_run
-from jbrep.rl.presets import PRESETS, get_preset, sb3_class
+from jbrep.rl.presets import ALGORITHMS, get_preset, sb3_class
 
 STEPS = 100  # of an episode: little depends on its length
 TASK = describe("face_direction", max_episode_steps=STEPS)
@@ -93,7 +93,7 @@ def test_table_one_reaches_ppo():
 
 @pytest.mark.parametrize(
     ("algorithm", "preset"),
-    [(algorithm, name) for name, its in PRESETS.items() for algorithm in its],
+    [(each, name) for each, its in ALGORITHMS.items() for name in its.presets],
 )
 def test_every_preset_makes_an_agent_with_adam(algorithm, preset):
     agent = agent_of(algorithm, preset)
@@ -102,7 +102,10 @@ def test_every_preset_makes_an_agent_with_adam(algorithm, preset):
     ]
     assert optimizers
     assert {type(o) for o in optimizers} == {torch.optim.Adam}
-    assert agent.predict(agent.env.reset())[0].shape == (PRESETS[preset][algorithm].num_envs, 1)
+    assert agent.predict(agent.env.reset())[0].shape == (
+        ALGORITHMS[algorithm].presets[preset].num_envs,
+        1,
+    )
 
 
 def test_a_runs_folder(short):
@@ -276,7 +279,7 @@ def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
     preset = get_preset("paper", algorithm)
     kwargs = {**preset.algorithm_kwargs, "learning_rate": 1e30}
     wild = preset.replace(algorithm_kwargs=kwargs)
-    monkeypatch.setitem(PRESETS["paper"], algorithm, wild)
+    monkeypatch.setitem(ALGORITHMS[algorithm].presets, "paper", wild)
     run = Run.of(algorithm=algorithm, steps=4096, **QUICK, preset="paper")
     result = train(run, tmp_path / "wild")
     assert result.status == FAILED

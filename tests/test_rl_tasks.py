@@ -29,8 +29,7 @@ from jbrep.rl.files import (
     read_run,
 )
 from jbrep.rl.policy import load_run, load_untrained
-from jbrep.rl.presets import PRESETS, get_preset
-from jbrep.rl.settings import CLASSES
+from jbrep.rl.presets import ALGORITHMS, get_preset
 
 CART = describe(cart.ID)
 PENDULUM, HOPPER = describe("Pendulum-v1", max_episode_steps=50), describe("Hopper-v5")
@@ -49,11 +48,12 @@ SHORTER = {
 @pytest.fixture
 def short_rollouts(monkeypatch):
     """The paper's settings with shorter rollouts and fewer updates."""
-    for algorithm, preset in PRESETS["paper"].items():
+    for known in ALGORITHMS.values():
+        preset = known.presets["paper"]
         kwargs = preset.algorithm_kwargs
         shorter = {name: value for name, value in SHORTER.items() if name in kwargs}
         quick = preset.replace(algorithm_kwargs={**kwargs, **shorter})
-        monkeypatch.setitem(PRESETS["paper"], algorithm, quick)
+        monkeypatch.setitem(known.presets, "paper", quick)
 
 
 def episodes_of(folder):
@@ -63,7 +63,7 @@ def episodes_of(folder):
 
 @pytest.mark.parametrize(
     ("task", "algorithm"),
-    [*((HOPPER, each) for each in CLASSES), (PENDULUM, "sac")],
+    [*((HOPPER, each) for each in ALGORITHMS), (PENDULUM, "sac")],
     ids=lambda given: getattr(given, "slug", given),
 )
 def test_every_algorithm_changes_its_weights_on_any_task(algorithm, task, short_rollouts, tmp_path):

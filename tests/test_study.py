@@ -30,7 +30,7 @@ from jbrep.errors import InputError
 from jbrep.reporting.findings import Findings
 from jbrep.reporting.tables import read_tables
 from jbrep.rl.files import CHECKPOINT, RUN, read_run
-from jbrep.rl.presets import PRESETS, get_preset
+from jbrep.rl.presets import ALGORITHMS, get_preset
 from jbrep.stats.rules import Rules
 from jbrep.studies.config import Data, Study, as_study, read_study
 from jbrep.studies.forecast import forecast
@@ -285,7 +285,7 @@ def test_a_data_set_from_elsewhere(collected, tmp_path):
 def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     preset = get_preset("paper", "a2c")
     wild = preset.replace(algorithm_kwargs={**preset.algorithm_kwargs, "learning_rate": 1e30})
-    monkeypatch.setitem(PRESETS["modern"], "a2c", wild)
+    monkeypatch.setitem(ALGORITHMS["a2c"].presets, "modern", wild)
     study = TINY.replace(algorithms=("a2c", "a2c-modern"), episode_steps=100)
     plan = Plan(study, tmp_path / "mixed")
     blocked = plan.folder_of(plan.cells[0])

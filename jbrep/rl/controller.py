@@ -25,12 +25,12 @@ from jbrep.records.storage import exists, taken, write_new
 from jbrep.rl.files import ENCODER, POLICY, POLICY_ZIP, RUN, is_run, read_finished
 from jbrep.rl.normalization import CLIP, Statistics
 from jbrep.rl.policy_file import PolicyFile, read
+from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.run_settings import RunSettings
 
 SEAL, NOT_SEALED = "sha256", "0" * 64  # of an ONNX file, in whose place zeros stand then
 _HIDDEN = "latent_pi.", "mlp_extractor.policy_net.", "mu."  # sequences, numbered from 0
 _LAST = "mu", "action_net"  # single layers after them
-_ON_POLICY = "ppo", "a2c", "trpo"  # whose actions are clipped; those of others are squashed
 _RENORM_EPSILON = 1e-3  # that CrossQ's batch renormalisation adds to the variance
 
 
@@ -117,7 +117,7 @@ class Controller:
             network=network_of(settings, encoder.latent_size, weights),
             low=np.array(self.task.action_low, np.float32),
             high=np.array(self.task.action_high, np.float32),
-            is_squashed=settings.algorithm not in _ON_POLICY,
+            is_squashed=ALGORITHMS[settings.algorithm].learns_off_policy,
         )
         self._one_row = isinstance(encoder, Encoder)
         self.reset()

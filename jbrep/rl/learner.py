@@ -13,8 +13,8 @@ from jbrep.errors import InputError
 from jbrep.records.document import read_toml, toml_text
 from jbrep.records.record import Record
 from jbrep.rl.overrides import overridden
-from jbrep.rl.presets import PRESETS, Hyperparameters, get_preset
-from jbrep.rl.settings import MAX_NAME, PAPER, LearnerName, base_name
+from jbrep.rl.presets import ALGORITHMS, PAPER, PRESETS, Hyperparameters, base_name, get_preset
+from jbrep.rl.settings import MAX_NAME, LearnerName
 from jbrep.text import slug
 
 _SUFFIX = ".toml"
@@ -27,8 +27,8 @@ class Learner(Record, frozen=True, kw_only=True):
     # what tables call it: ddpg, with the preset paper; sac-modern, with another; or a name of the
     # user's
     name: LearnerName
-    algorithm: str  # a key of CLASSES
-    preset: str  # the base, a key of PRESETS
+    algorithm: str  # a key of ALGORITHMS
+    preset: str  # the base, one of PRESETS
     overrides: Mapping[str, Any] = {}  # what is set differently there
     # the values of settings, one of which each seed of a study draws
     draws: Mapping[str, tuple[Any, ...]] = {}
@@ -79,7 +79,7 @@ class Learner(Record, frozen=True, kw_only=True):
         learner = learner.replace(draws=draws)
         for each in learner.variants:
             _ = each.hyperparameters
-        presets = {base_name(each, its) for its in PRESETS for each in PRESETS[its]}
+        presets = {base_name(each, its) for each in ALGORITHMS for its in ALGORITHMS[each].presets}
         if name in presets and learner != cls.of(name):
             raise InputError(f'it is a preset\'s name: give it another and base = "{base}"')
         return learner

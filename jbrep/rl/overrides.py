@@ -12,19 +12,18 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from gymnasium import spaces
 from msgspec import Meta
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from jbrep.errors import InputError, refusing
 from jbrep.records.record import converted, pattern, shown, to_plain
 from jbrep.rl.agent import ACTIVATIONS, Spaces, global_random_state_kept, make_agent, one_line
 from jbrep.rl.presets import (
+    ALGORITHMS,
     Hyperparameters,
     NetArch,
     argument,
     get_preset,
     parameters_of,
-    sb3_class,
 )
 
 _MOST = 10**9  # of any number
@@ -121,7 +120,7 @@ def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> 
 
 def setting_names(algorithm: str) -> list[str]:
     """What can be set of an algorithm."""
-    own = _OWN if is_off_policy(algorithm) else _OWN - {"noise"}
+    own = _OWN if ALGORITHMS[algorithm].learns_off_policy else _OWN - {"noise"}
     return sorted({*_parameters(algorithm), *_policy_parameters(algorithm), *own})
 
 
@@ -142,7 +141,7 @@ def check_shape(algorithm: str, hyperparameters: Hyperparameters) -> Hyperparame
 
 def without_buffer(algorithm: str, hyperparameters: Hyperparameters) -> Hyperparameters:
     """The same with the smallest replay buffer, for an agent that nothing is added to."""
-    if not is_off_policy(algorithm):
+    if not ALGORITHMS[algorithm].learns_off_policy:
         return hyperparameters
     of_class = {**hyperparameters.algorithm_kwargs, "buffer_size": 1}
     return hyperparameters.replace(algorithm_kwargs=of_class)
@@ -184,14 +183,9 @@ def _of_policy(algorithm: str, name: str, value: Any) -> Any:
 
 
 def _check_parts(algorithm: str, net_arch: NetArch) -> None:
-    parts = ["pi", "qf"] if is_off_policy(algorithm) else ["pi", "vf"]
+    parts = ["pi", "qf" if ALGORITHMS[algorithm].learns_off_policy else "vf"]
     if isinstance(net_arch, Mapping) and sorted(net_arch) != parts:
         raise InputError(f"net_arch is {shown(net_arch)}: its parts must be {' and '.join(parts)}")
-
-
-def is_off_policy(algorithm: str) -> bool:
-    """Whether an algorithm learns from a replay buffer."""
-    return issubclass(sb3_class(algorithm), OffPolicyAlgorithm)
 
 
 def _typed(name: str, value: Any, annotation: Any) -> Any:

@@ -1,21 +1,21 @@
-"""The hyperparameters of algorithms, and the presets of them, as data."""
+"""Algorithms of stable-baselines3, and the presets of their hyperparameters, as data."""
 
 from collections.abc import Mapping
 from functools import cache
 from inspect import Parameter, signature
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
 import msgspec
 from msgspec import Meta
 
-from jbrep.errors import InputError, choose
+from jbrep.errors import choose
 from jbrep.records.record import Finite, Record, from_plain
-from jbrep.rl.settings import CLASSES, MODERN, PAPER, WIDE
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
+PAPER, MODERN, WIDE = PRESETS = ("paper", "modern", "wide")
 MAX_LAYERS, MAX_UNITS = 8, 1024  # of a policy's network
 MAX_ENVS = 4096
 MAX_REPEAT = 1000
@@ -98,126 +98,162 @@ class Hyperparameters(Record, frozen=True):
         return -(-control_steps // self.action_repeat)
 
 
-_SHARED = {"learning_rate": 1e-4, "gamma": 0.99}
+class Algorithm(NamedTuple):
+    """An algorithm of stable-baselines3, or of others like it."""
+
+    path: str  # of its class
+    presets: Mapping[str, Hyperparameters]
+    learns_off_policy: bool = True  # from a replay buffer; its actions are squashed, not clipped
+
+
 _HIDDEN = (350, 250)
+_SHARED = {"learning_rate": 1e-4, "gamma": 0.99}
+_NOISE = NormalNoise(sigma=0.2)
+_OFTEN = {"learning_rate": 3e-4, "learning_starts": 1000, "train_freq": 4}
+_MANY_ROBOTS = Hyperparameters(  # few gradient steps: one for 16 steps of a robot
+    (128, 128),
+    {
+        "learning_rate": 1e-3,
+        "gamma": 0.99,
+        "buffer_size": 1_000_000,
+        "learning_starts": 12_800,
+        "train_freq": 1,
+        "gradient_steps": 8,
+        "batch_size": 512,
+    },
+    num_envs=64,
+    action_repeat=2,
+)
+_OF_ENTROPY = {  # the paper has SAC alone
+    PAPER: Hyperparameters(
+        _HIDDEN, {**_SHARED, "batch_size": 256, "ent_coef": "auto"}, noise=_NOISE
+    ),
+    MODERN: Hyperparameters((256, 256), _OFTEN),
+    WIDE: _MANY_ROBOTS,
+}
 _ON_POLICY: dict[str, Any] = {
     "num_envs": 8,
     "optimizer_kwargs": {"eps": 1e-5},  # as stable-baselines3 sets it for PPO and A2C
 }
-_PAPER = {
-    "ddpg": Hyperparameters(
-        _HIDDEN,
+
+ALGORITHMS = {
+    "ddpg": Algorithm(
+        "stable_baselines3.DDPG",
         {
-            **_SHARED,
-            "batch_size": 256,
-            "gradient_steps": 50,
-            "train_freq": 100,
-            "buffer_size": 1_000_000,
-            "tau": 1e-3,
+            PAPER: Hyperparameters(
+                _HIDDEN,
+                {
+                    **_SHARED,
+                    "batch_size": 256,
+                    "gradient_steps": 50,
+                    "train_freq": 100,
+                    "buffer_size": 1_000_000,
+                    "tau": 1e-3,
+                },
+                noise=OrnsteinUhlenbeckNoise(mean=0.3, sigma=0.3, theta=0.15),
+            ),
+            MODERN: Hyperparameters((256, 256), _OFTEN, noise=_NOISE),
+            WIDE: _MANY_ROBOTS.replace(noise=_NOISE),
         },
-        noise=OrnsteinUhlenbeckNoise(mean=0.3, sigma=0.3, theta=0.15),
     ),
-    "td3": Hyperparameters(
-        _HIDDEN,
-        {**_SHARED, "learning_starts": 10_000, "gradient_steps": 1000, "train_freq": 1000},
-        noise=NormalNoise(sigma=0.2),
-    ),
-    **{
-        name: Hyperparameters(
-            _HIDDEN,
-            {**_SHARED, "batch_size": 256, "ent_coef": "auto"},
-            noise=NormalNoise(sigma=0.2),
-        )
-        for name in ("sac", "tqc", "crossq")  # the paper has sac alone
-    },
-    "ppo": Hyperparameters(
-        _HIDDEN,
+    "td3": Algorithm(
+        "stable_baselines3.TD3",
         {
-            **_SHARED,
-            "n_steps": 256,
-            "ent_coef": 0.01,
-            "vf_coef": 0.5,
-            "max_grad_norm": 0.5,
-            "gae_lambda": 0.95,
-            "batch_size": 512,  # 4 minibatches of the 8 x 256 steps
-            "clip_range": 0.2,
-            "clip_range_vf": None,
-            "n_epochs": 4,
+            PAPER: Hyperparameters(
+                _HIDDEN,
+                {**_SHARED, "learning_starts": 10_000, "gradient_steps": 1000, "train_freq": 1000},
+                noise=_NOISE,
+            ),
+            MODERN: Hyperparameters((256, 256), _OFTEN, noise=_NOISE),
+            WIDE: _MANY_ROBOTS.replace(noise=_NOISE),
         },
-        **_ON_POLICY,
     ),
-    "a2c": Hyperparameters(_HIDDEN, {**_SHARED, "use_rms_prop": False}, **_ON_POLICY),
-    "trpo": Hyperparameters(_HIDDEN, {**_SHARED, "n_steps": 256}, **_ON_POLICY),
+    "sac": Algorithm("stable_baselines3.SAC", {**_OF_ENTROPY}),
+    "ppo": Algorithm(
+        "stable_baselines3.PPO",
+        {
+            PAPER: Hyperparameters(
+                _HIDDEN,
+                {
+                    **_SHARED,
+                    "n_steps": 256,
+                    "ent_coef": 0.01,
+                    "vf_coef": 0.5,
+                    "max_grad_norm": 0.5,
+                    "gae_lambda": 0.95,
+                    "batch_size": 512,  # 4 minibatches of the 8 x 256 steps
+                    "clip_range": 0.2,
+                    "clip_range_vf": None,
+                    "n_epochs": 4,
+                },
+                **_ON_POLICY,
+            ),
+            MODERN: Hyperparameters(
+                (64, 64),
+                {"learning_rate": 3e-4, "n_steps": 256, "batch_size": 64, "n_epochs": 10},
+                **_ON_POLICY,
+            ),
+        },
+        learns_off_policy=False,
+    ),
+    "a2c": Algorithm(
+        "stable_baselines3.A2C",
+        {
+            PAPER: Hyperparameters(_HIDDEN, {**_SHARED, "use_rms_prop": False}, **_ON_POLICY),
+            MODERN: Hyperparameters(
+                (64, 64),
+                {"learning_rate": 7e-4, "use_rms_prop": False, "n_steps": 8, "gae_lambda": 0.9},
+                **_ON_POLICY,
+            ),
+        },
+        learns_off_policy=False,
+    ),
+    "trpo": Algorithm(
+        "sb3_contrib.TRPO",
+        {
+            PAPER: Hyperparameters(_HIDDEN, {**_SHARED, "n_steps": 256}, **_ON_POLICY),
+            MODERN: Hyperparameters(
+                (64, 64),
+                {"learning_rate": 1e-3, "n_steps": 256, "n_critic_updates": 20, "cg_damping": 0.1},
+                **_ON_POLICY,
+            ),
+        },
+        learns_off_policy=False,
+    ),
+    "tqc": Algorithm("sb3_contrib.TQC", {**_OF_ENTROPY}),
+    "crossq": Algorithm(
+        "sb3_contrib.CrossQ",
+        {
+            **_OF_ENTROPY,
+            MODERN: Hyperparameters(  # its own layers and learning rate; it has no target networks
+                {"pi": (256, 256), "qf": (1024, 1024)}, {**_OFTEN, "learning_rate": 1e-3}
+            ),
+        },
+    ),
 }
 
-_OFF_POLICY = {"learning_rate": 3e-4, "learning_starts": 1000, "train_freq": 4}
-_MODERN = {
-    "ddpg": Hyperparameters((256, 256), _OFF_POLICY, noise=NormalNoise(sigma=0.2)),
-    "td3": Hyperparameters((256, 256), _OFF_POLICY, noise=NormalNoise(sigma=0.2)),
-    "sac": Hyperparameters((256, 256), _OFF_POLICY),
-    "tqc": Hyperparameters((256, 256), _OFF_POLICY),
-    "crossq": Hyperparameters(  # its own layers and learning rate; it has no target networks
-        {"pi": (256, 256), "qf": (1024, 1024)}, {**_OFF_POLICY, "learning_rate": 1e-3}
-    ),
-    "ppo": Hyperparameters(
-        (64, 64),
-        {"learning_rate": 3e-4, "n_steps": 256, "batch_size": 64, "n_epochs": 10},
-        **_ON_POLICY,
-    ),
-    "a2c": Hyperparameters(
-        (64, 64),
-        {"learning_rate": 7e-4, "use_rms_prop": False, "n_steps": 8, "gae_lambda": 0.9},
-        **_ON_POLICY,
-    ),
-    "trpo": Hyperparameters(
-        (64, 64),
-        {"learning_rate": 1e-3, "n_steps": 256, "n_critic_updates": 20, "cg_damping": 0.1},
-        **_ON_POLICY,
-    ),
-}
 
-_MANY_ROBOTS = {  # few gradient steps: one for 16 steps of a robot
-    "learning_rate": 1e-3,
-    "gamma": 0.99,
-    "buffer_size": 1_000_000,
-    "learning_starts": 12_800,
-    "train_freq": 1,
-    "gradient_steps": 8,
-    "batch_size": 512,
-}
-_WIDE = {
-    name: Hyperparameters((128, 128), _MANY_ROBOTS, num_envs=64, noise=noise, action_repeat=2)
-    for name, noise in {
-        "ddpg": NormalNoise(sigma=0.2),
-        "td3": NormalNoise(sigma=0.2),
-        "sac": None,
-        "tqc": None,
-        "crossq": None,
-    }.items()
-}
-PRESETS = {PAPER: _PAPER, MODERN: _MODERN, WIDE: _WIDE}
+def base_name(algorithm: str, preset: str) -> str:
+    """An algorithm with its preset, unless that is the paper's: ddpg, sac-modern."""
+    return algorithm if preset == PAPER else f"{algorithm}-{preset}"
 
 
 def usual_preset(algorithm: str) -> str:
     """The preset that commands take if none is named: many robots, where it has the algorithm."""
-    return WIDE if algorithm in _WIDE else MODERN
+    known = choose(algorithm, ALGORITHMS, "algorithm").presets
+    return WIDE if WIDE in known else MODERN
 
 
 def get_preset(preset: str, algorithm: str) -> Hyperparameters:
     """The hyperparameters of an algorithm in the preset of that name."""
-    choose(algorithm, CLASSES, "algorithm")
-    of_preset = choose(preset, PRESETS, "preset")
-    if algorithm not in of_preset:
-        raise InputError(
-            f"the preset {preset} is for {', '.join(of_preset)}, not {algorithm}: choose one of "
-            f"{', '.join(name for name, its in PRESETS.items() if algorithm in its)}"
-        )
-    return of_preset[algorithm]
+    known = choose(algorithm, ALGORITHMS, "algorithm").presets
+    return choose(preset, known, f"preset of {algorithm}")
 
 
 def sb3_class(algorithm: str) -> "type[BaseAlgorithm]":
     """The class that has an algorithm in stable-baselines3."""
-    return cast("type[BaseAlgorithm]", resolve_name(choose(algorithm, CLASSES, "algorithm")))
+    path = choose(algorithm, ALGORITHMS, "algorithm").path
+    return cast("type[BaseAlgorithm]", resolve_name(path))
 
 
 @cache

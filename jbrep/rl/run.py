@@ -18,9 +18,8 @@ from jbrep.envs.task import Task
 from jbrep.records.record import Sha256, to_plain
 from jbrep.rl.agent import evaluate, make_agent, make_env
 from jbrep.rl.learner import Learner
-from jbrep.rl.overrides import is_off_policy
 from jbrep.rl.policy import policy_to_begin_with
-from jbrep.rl.presets import usual_preset
+from jbrep.rl.presets import ALGORITHMS, usual_preset
 from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_EPISODES, Name, Seed, TrainingSettings
 from jbrep.training.trainer import get_device, single_torch_thread
@@ -109,7 +108,7 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
 
 def estimate(run: Run) -> float:
     """Seconds that a run takes on one core of this machine with nothing else running."""
-    if is_off_policy(run.learner.algorithm):
+    if ALGORITHMS[run.learner.algorithm].learns_off_policy:
         run = run.replace(learner=run.learner.overridden(_at_once(run)))
     encoder = run.find_encoder()
     settings = run.settings(encoder)

@@ -9,9 +9,8 @@ from msgspec import UNSET, UnsetType
 from jbrep.envs.task import Id, Task
 from jbrep.errors import differences
 from jbrep.records.record import Sha256, pattern, to_plain
-from jbrep.rl.presets import LINEAR, Hyperparameters, learns_from
+from jbrep.rl.presets import ALGORITHMS, Hyperparameters, learns_from
 from jbrep.rl.settings import (
-    CLASSES,
     Episodes,
     LearnerName,
     Line,
@@ -21,7 +20,9 @@ from jbrep.rl.settings import (
     TrainingSettings,
 )
 
-_Algorithm = Annotated[str, pattern(rf"\A({'|'.join(CLASSES)})\Z", f"one of {', '.join(CLASSES)}")]
+_Algorithm = Annotated[
+    str, pattern(rf"\A({'|'.join(ALGORITHMS)})\Z", f"one of {', '.join(ALGORITHMS)}")
+]
 
 
 class SharedSettings(TrainingSettings, frozen=True, kw_only=True):

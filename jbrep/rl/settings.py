@@ -7,18 +7,7 @@ from msgspec import Meta
 from jbrep.errors import InputError
 from jbrep.records.record import Record, pattern
 
-CLASSES = {  # by the names of algorithms
-    "ddpg": "stable_baselines3.DDPG",
-    "td3": "stable_baselines3.TD3",
-    "sac": "stable_baselines3.SAC",
-    "ppo": "stable_baselines3.PPO",
-    "a2c": "stable_baselines3.A2C",
-    "trpo": "sb3_contrib.TRPO",
-    "tqc": "sb3_contrib.TQC",
-    "crossq": "sb3_contrib.CrossQ",
-}
 CPU, CUDA = "cpu", "cuda"
-PAPER, MODERN, WIDE = "paper", "modern", "wide"  # presets; a name without one has the paper's
 MAX_STEPS = 10**12  # of training
 MAX_EPISODES = 10_000  # of an evaluation
 
@@ -95,8 +84,3 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
         """These settings, without those that a subclass adds."""
         own = TrainingSettings.__struct_fields__
         return TrainingSettings(**{name: getattr(self, name) for name in own})
-
-
-def base_name(algorithm: str, preset: str) -> str:
-    """An algorithm with its preset, unless that is the paper's: ddpg, sac-modern."""
-    return algorithm if preset == PAPER else f"{algorithm}-{preset}"
