@@ -20,7 +20,7 @@ from jbrep.encoders import find
 from jbrep.encoders.layers import run
 from jbrep.envs import describe
 from jbrep.training.network import ARCHITECTURES, stacks
-from jbrep.training.trainer import Schedule, Trainer
+from jbrep.training.trainer import Trainer
 from jbrep.training.windows import Windows
 
 ROWS = 4_000_000
@@ -65,8 +65,8 @@ def usual_epoch(rows: torch.Tensor) -> None:
 
 
 def our_epoch(rows: torch.Tensor) -> None:
-    network = Reconstruction(DAE(latent=LATENT), SIZE, noise=NOISE)
-    how = Schedule(epochs=1, batch_size=BATCH, learning_rate=5e-4)
+    how = DAE(latent=LATENT, epochs=1, batch_size=BATCH, learning_rate=5e-4)
+    network = Reconstruction(how, SIZE, noise=NOISE)
     train, held_out = cast("Windows", Rows(rows)), cast("Windows", Rows(rows[:1]))
     next(Trainer(network.to(rows.device), how, train, held_out).epochs())
 

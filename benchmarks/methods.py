@@ -21,7 +21,7 @@ from jbrep.dataset import ScaledDataset
 from jbrep.methods.registry import METHODS
 from jbrep.training.method import ClosedForm, Learned, Method
 from jbrep.training.objective import Objective
-from jbrep.training.trainer import Schedule, Trainer, default_batch_size
+from jbrep.training.trainer import Trainer, default_batch_size
 from jbrep.training.windows import Windows, watched_windows
 
 TASK = "face_direction"
@@ -93,7 +93,7 @@ def compare(name: str, method: Learned, data: ScaledDataset) -> None:
     horizon = objective.horizon
     windows = Windows(data, data.train, horizon)
     size = method.batch_size or default_batch_size(MILLION)
-    schedule = Schedule(epochs=ROUNDS + 1, batch_size=size, learning_rate=1e-3)
+    schedule = method.replace(epochs=ROUNDS + 1, batch_size=size, learning_rate=1e-3)
     watched = watched_windows(data, horizon, torch.device("cpu"))
     epochs = Trainer(objective, schedule, windows, watched).epochs()
     next(epochs)  # loads the rows

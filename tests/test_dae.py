@@ -10,7 +10,7 @@ from jbrep.dae import DAE, Gradient, Reconstruction
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.training.network import ARCHITECTURES, layers, stacks
-from jbrep.training.trainer import Schedule, Trainer
+from jbrep.training.trainer import Trainer
 
 
 def rows(count=600, size=16, seed=0):
@@ -22,11 +22,11 @@ def rows(count=600, size=16, seed=0):
 
 def trainer(train=None, latent=4, architecture="paper", noise=0.1, seed=0, **how):
     train = rows() if train is None else train
-    method = DAE(latent=latent, architecture=architecture, seed=seed)
+    how = {"epochs": 3, "batch_size": 100, "learning_rate": 3e-3, **how}
+    method = DAE(latent=latent, architecture=architecture, seed=seed, **how)
     objective = Reconstruction(method, train.shape[1], noise=noise)
-    schedule = {"epochs": 3, "batch_size": 100, "learning_rate": 3e-3, "seed": seed, **how}
     windows, watched = TensorWindows(train), TensorWindows(train[:50])
-    return Trainer(objective, Schedule(**schedule), windows, watched)
+    return Trainer(objective, method, windows, watched)
 
 
 def trained(**changes):

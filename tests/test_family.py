@@ -12,7 +12,7 @@ from jbrep.methods import vae
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import METHODS, name_of, read_name
 from jbrep.methods.vae import cross_entropy, divergence, posterior
-from jbrep.training.trainer import Schedule, Trainer
+from jbrep.training.trainer import Trainer
 from jbrep.training.windows import Windows
 
 # Epochs and learning rate for 4,000 rows, and the R^2 that must be passed
@@ -24,10 +24,11 @@ def objective(data, kind, **changes):
 
 
 def trainer(data, kind, epochs=2, learning_rate=1e-3, batch_size=250, **changes):
-    it = objective(data, kind, **changes)
-    parts = (Windows(data, rows, it.horizon) for rows in (data.train, data.test))
     how = {"epochs": epochs, "learning_rate": learning_rate, "batch_size": batch_size}
-    return Trainer(it, Schedule(**how), *parts)
+    method = METHODS[kind].of({"latent": 8, **how, **changes})
+    it = method.objective(data)
+    parts = (Windows(data, rows, it.horizon) for rows in (data.train, data.test))
+    return Trainer(it, method, *parts)
 
 
 def explained(encoder, data):

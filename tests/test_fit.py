@@ -22,7 +22,7 @@ from jbrep.errors import InputError
 from jbrep.evaluation.held_out import HeldOut
 from jbrep.evaluation.reconstruction import reconstruction
 from jbrep.methods.fit import Fitter
-from jbrep.methods.linear import lost, ratio_to_pca
+from jbrep.methods.linear import lost
 from jbrep.methods.registry import METHODS, read_name
 from jbrep.records.storage import exclusive
 from jbrep.training.method import USUAL
@@ -156,15 +156,6 @@ def test_observations_that_cannot_be_reduced_are_refused(tmp_path):
         Fitter(data, tmp_path).plan("dae", latent=4)
 
 
-def test_an_encoder_is_compared_with_pca(data, tmp_path):
-    fitter = Fitter(data, tmp_path)
-    short, full, theirs = (fitter.fit(k, **how(k)).encoder for k in ("dae", "full", "pca"))
-    assert ratio_to_pca(theirs, data) == pytest.approx(1)
-    errors = [encoder.header.metrics["held_out_mse"] for encoder in (short, theirs)]
-    assert ratio_to_pca(short, data) == pytest.approx(errors[0] / errors[1])
-    assert ratio_to_pca(full, data) is None
-
-
 def test_on_symmetry_an_encoder_is_compared_over_what_symmetry_tells(data, tmp_path):
     """It leaves out where the robot is, which PCA is not to be blamed for losing."""
     fitter = Fitter(data, tmp_path)
@@ -177,7 +168,6 @@ def test_on_symmetry_an_encoder_is_compared_over_what_symmetry_tells(data, tmp_p
     told = [name not in ours.not_decoded for name in data.task.feature_names]
     assert 0 < sum(told) < len(told)
     expected = errors[0][told].sum() / errors[1][told].sum()
-    assert ratio_to_pca(ours, data) == pytest.approx(expected, rel=1e-4)
     judged = reconstruction(ours, HeldOut(data)).ratio_to_pca
     assert judged.value == pytest.approx(expected, rel=1e-4)
     assert errors[0].sum() / errors[1].sum() < 0.95 * expected
@@ -192,7 +182,6 @@ def test_where_pca_loses_nothing_there_is_no_ratio(tmp_path):
     fitter = Fitter(made, tmp_path)
     untrained = fitter.fit("untrained", latent=4).encoder
     scaled = ScaledDataset(made)
-    assert ratio_to_pca(untrained, scaled) is None
     assert reconstruction(untrained, HeldOut(scaled)).ratio_to_pca is None
 
 
@@ -206,28 +195,10 @@ def test_an_encoder_has_the_same_bytes_whatever_the_number_of_threads(kind, data
     assert made[0].read_bytes() == made[1].read_bytes()
 
 
-def test_the_command_takes_sizes_in_any_form_and_says_what_each_is_good_for(
-    collected, tmp_path, monkeypatch
-):
-    monkeypatch.setenv("COLUMNS", "80")
+def test_the_command_takes_sizes_in_any_form(collected, tmp_path):
     out = ("--data", collected, "--out", tmp_path / "it")
     told = jbrep("train-dae", "--latent", "5,4", 3, "--epochs", 1, *out).stdout
-    assert all(len(line) <= 80 or " " not in line for line in told.splitlines())  # or a path
     assert re.findall(r"^([\w-]+): reconstructs", told, re.MULTILINE) == ["dae-5", "dae-4", "dae-3"]
-    assert re.search(r"worse than\s+PCA: [.\d]+ times its\s+error", told)
-    assert "train for more --epochs" in " ".join(told.split())
-    for kind, expected in (
-        ("pca", r"reconstructs held-out states with a mean squared error of 0\.\d+"),
-        ("slow", r"changes slowly: units correlate [01]\.\d\d to -?0\.\d\d with themselves"),
-    ):
-        told = " ".join(
-            jbrep("train-encoder", "--kind", kind, "--latent", "3,", *out).stdout.split()
-        )
-        assert re.match(f"{kind}-3: {expected}", told), told
-    assert jbrep("train-encoder", "--kind", "full", *out).exit_code == 0
-    assert load(tmp_path / "it" / "full.safetensors").name == "full"
-    refused = jbrep("train-dae", "--latent", "8x", *out)
-    assert (refused.exit_code, "latent" in refused.stderr) == (2, True)
 
 
 def test_a_last_batch_of_one_row_ends_no_training(tmp_path):

@@ -14,7 +14,7 @@ from jbrep.methods.fit import Fitter
 from jbrep.methods.forward import Forward
 from jbrep.methods.linear import principal_code
 from jbrep.methods.registry import get_method
-from jbrep.training.trainer import Schedule, Trainer
+from jbrep.training.trainer import Trainer
 from jbrep.training.windows import Windows
 
 KINDS = ("forward", "self-prediction", "deepmdp")
@@ -57,11 +57,11 @@ def hidden():
 
 def train(data, kind, epochs, **settings):
     """A trained objective and the history of its losses."""
-    method = get_method(kind).of({"latent": 2, "learning_rate": 5e-3, **settings})
+    how = {"latent": 2, "learning_rate": 5e-3, "epochs": epochs, "batch_size": 200}
+    method = get_method(kind).of({**how, **settings})
     objective = method.objective(data)
     windows, watched = (Windows(data, r, objective.horizon) for r in (data.train, data.test))
-    schedule = Schedule(epochs=epochs, batch_size=200, learning_rate=method.learning_rate)
-    trainer = Trainer(objective, schedule, windows, watched)
+    trainer = Trainer(objective, method, windows, watched)
     for _ in trainer.epochs():
         pass
     return objective.eval(), trainer.history

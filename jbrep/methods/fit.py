@@ -21,19 +21,17 @@ from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader, check_name
 from jbrep.encoders.layers import Layer, dense, run
 from jbrep.envs.task import Array
 from jbrep.errors import InputError, differences
-from jbrep.methods.linear import DEVIATION, PCA, held_out_error, inverse_root, ratio_to_pca
-from jbrep.methods.registry import METHODS, get_method, name_of
+from jbrep.methods.linear import DEVIATION, held_out_error, inverse_root
+from jbrep.methods.registry import get_method, name_of
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.storage import exclusive, exists, make_folder
-from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method, Reconstructing
+from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method
 from jbrep.training.objective import Layers
 from jbrep.training.trainer import Epoch, Trainer, default_batch_size, get_device, single_thread
 from jbrep.training.windows import Windows, count_windows, watched_windows
 
-_ALIKE = 0.05  # of PCA's error, within which another is as good
 _NEGLIGIBLE = 1e-12  # variance of a unit that says nothing
-_POOR = 1.5  # times PCA's error, from which a trained autoencoder deserves a warning
 
 
 class Fitted(NamedTuple):
@@ -42,13 +40,13 @@ class Fitted(NamedTuple):
     encoder: Encoder
     path: Path
     is_new: bool  # False if the file was complete already
-    data: ScaledDataset  # that it was made from
 
     def __repr__(self) -> str:
-        """Whether it is good at what its kind is for."""
-        told = purpose(self.encoder, self.data) or "jbrep evaluate shows what it keeps"
+        lost = self.encoder.header.metrics[HELD_OUT_MSE]
         return (
-            f"{self.encoder.name}: {told}; {self.path}{'' if self.is_new else ', already complete'}"
+            f"{self.encoder.name}: reconstructs held-out states with a mean squared error of "
+            f"{lost:.5f}, of features scaled to [-1, 1]; {self.path}"
+            f"{'' if self.is_new else ', already complete'}"
         )
 
 
@@ -104,7 +102,7 @@ class Fitter:
         with single_thread():
             plan = self.plan(kind, name=name, **settings)
             is_new = not plan.is_complete() and self._make_once(plan)
-        return Fitted(load(plan.path), plan.path, is_new, self._data)
+        return Fitted(load(plan.path), plan.path, is_new)
 
     def plan(self, kind: str, *, name: str | None = None, **settings: Any) -> Plan:
         """What `fit` would make."""
@@ -242,29 +240,6 @@ def _with_progress(trainer: Trainer, name: str) -> Iterator[Epoch]:
             progress.set_postfix(train=f"{epoch.train_loss:.5f}", test=f"{epoch.test_loss:.5f}")
             progress.update()
             yield epoch
-
-
-def purpose(encoder: Encoder, data: ScaledDataset) -> str:
-    """How good an encoder that was made of these data is at what its kind is for, in words.
-
-    Empty of one that is for nothing of its own.
-    """
-    method = METHODS[encoder.kind]
-    if not issubclass(method, Reconstructing | PCA):
-        return method.achieved(encoder.header.metrics, encoder.latent_size - len(encoder.kept))
-    error = f"{encoder.header.metrics[HELD_OUT_MSE]:.5f}, of features scaled to [-1, 1]"
-    ratio = ratio_to_pca(encoder, data)
-    if method is PCA or ratio is None:
-        return f"reconstructs held-out states with a mean squared error of {error}"
-    beside = "better than" if ratio < 1 else "worse than"
-    beside = "as well as" if abs(ratio - 1) < _ALIKE else beside
-    told = f"reconstructs held-out states {beside} PCA: {ratio:.2f} times its error ({error})"
-    if ratio <= _POOR:
-        return told
-    return (
-        f"{told}; train for more --epochs, on more data, or with another --learning-rate or "
-        "--batch-size"
-    )
 
 
 def complete(

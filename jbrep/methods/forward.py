@@ -64,12 +64,6 @@ class LinearForward(Directions, frozen=True, kw_only=True):
         super().check_data(data)
         check_targets(data, self.name, weights_of(self))
 
-    @classmethod
-    def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        explained = [each**2 for each in metrics["spectrum"]]
-        share = sum(explained[:latent]) / sum(explained)
-        return f"keeps {share:.0%} of what a linear code can tell of what comes next"
-
     def make(self, data: ScaledDataset) -> Made:
         size = data.size
         moments, shared, variances = _moments(data, self.horizons)
@@ -186,16 +180,6 @@ class Forward(Network, Learned, frozen=True, kw_only=True):
     def check_data(self, data: ScaledDataset) -> None:
         super().check_data(data)
         check_targets(data, self.name, {**weights_of(self), "inverse": self.inverse})
-
-    @classmethod
-    def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        steps, lost = max(metrics["loss_by_horizon"].items(), key=lambda each: int(each[0]))
-        known = [part for part in ("changes", "reward") if part in lost] or list(lost)
-        if not known:  # only the action was to be told
-            return ""
-        told = " and ".join(f"{1 - lost[part]:.2f} of the {part}" for part in known)
-        what = "1 - error / variance in the training part"
-        return f"predicts {told} over {steps} held-out steps ({what})"
 
     def objective(self, data: ScaledDataset) -> Objective:
         return ForwardObjective(self, data)

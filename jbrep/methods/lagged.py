@@ -1,7 +1,7 @@
 """Slow features and VAMP: linear codes from covariances of now with some steps later."""
 
-from collections.abc import Callable, Mapping
-from typing import Annotated, Any, ClassVar
+from collections.abc import Callable
+from typing import Annotated, ClassVar
 
 import numpy as np
 from msgspec import Meta
@@ -56,12 +56,6 @@ class Lagged:
             total /= windows
 
 
-def _correlations(metrics: Mapping[str, Any], latent: int) -> str:
-    """From the first unit to the last: 0.98 to 0.41."""
-    first, *others = metrics["spectrum"][:latent]
-    return f"{first:.2f} to {others[-1]:.2f}" if others else f"{first:.2f}"
-
-
 class Slow(Directions, frozen=True, kw_only=True):
     """Slow features: the l linear directions that change least over a lag (TICA).
 
@@ -77,11 +71,6 @@ class Slow(Directions, frozen=True, kw_only=True):
     name: ClassVar[str] = "slow"
 
     lags: Lags = (10,)
-
-    @classmethod
-    def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        found = _correlations(metrics, latent)
-        return f"changes slowly: units correlate {found} with themselves a lag later"
 
     def make(self, data: ScaledDataset) -> Made:
         lagged = Lagged(data, self.lags, data.size, lambda block: block.later(0))
@@ -117,11 +106,6 @@ class Vamp(Directions, frozen=True, kw_only=True):
     name: ClassVar[str] = "vamp"
 
     lags: Lags = (10,)
-
-    @classmethod
-    def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        found = _correlations(metrics, latent)
-        return f"tells the state a lag later: units correlate {found} with it"
 
     def make(self, data: ScaledDataset) -> Made:
         size, longest = data.size, max(self.lags)

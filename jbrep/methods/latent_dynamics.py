@@ -5,7 +5,6 @@ self-prediction, without rewards.
 """
 
 import math
-from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -46,13 +45,6 @@ class DeepMDP(Network, Learned, frozen=True, kw_only=True):
                 f"deepmdp needs a reward that varies, and there is none in {data.dataset.folder}: "
                 "the code would be constant"
             )
-
-    @classmethod
-    def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        told = 1 - metrics["loss_by_term"]["reward"]
-        return (
-            f"predicts {told:.2f} of held-out rewards (1 - error / variance in the training part)"
-        )
 
     def objective(self, data: ScaledDataset) -> Objective:
         return DeepMDPObjective(self, data)

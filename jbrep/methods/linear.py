@@ -3,7 +3,6 @@
 Principal components are also what other encoders' reconstructions are compared with.
 """
 
-from collections.abc import Container
 from typing import ClassVar
 
 import numpy as np
@@ -13,7 +12,6 @@ from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.header import EncoderHeader
 from jbrep.encoders.layers import dense
 from jbrep.envs.task import Array
 from jbrep.errors import InputError
@@ -119,19 +117,14 @@ class Directions(Coded, ClosedForm, frozen=True, kw_only=True):
         super().check_data(data)
 
 
-def held_out_error(
-    encoder: Encoder, data: ScaledDataset, not_decoded: Container[str] = ()
-) -> float:
+def held_out_error(encoder: Encoder, data: ScaledDataset) -> float:
     """Mean squared error of the reconstruction over all held-out rows, scaled to [-1, 1].
 
-    Features that are `not_decoded` count as 0. Rounded to six digits: the others depend on the
-    number of threads.
+    Rounded to six digits: the others depend on the number of threads.
     """
-    decoded = [name not in not_decoded for name in data.task.feature_names]
     total = 0.0
     for rows in data.observations(data.test):
-        error = lost(encoder, rows, data)[:, decoded]
-        total += float(np.square(error, dtype=np.float64).sum())
+        total += float(np.square(lost(encoder, rows, data), dtype=np.float64).sum())
     return float(f"{total / (len(data.test) * data.task.size):.6g}")
 
 
@@ -147,18 +140,3 @@ def lost(
     if isinstance(encoder, Encoder) and (coordinates := encoder.scaler.coordinates):
         rows = coordinates.inverse(coordinates.forward(rows))
     return (encoder.comparable(back, rows) - rows) / data.scaler.half_width
-
-
-def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
-    """An encoder's held-out error as a multiple of PCA's, with as many components.
-
-    Both are of what the encoder tells at all: symmetry leaves out where the robot is. None where
-    PCA loses nothing.
-    """
-    if encoder.latent_size >= data.task.size:
-        return None
-    layers = principal_code(data, encoder.latent_size)
-    header = EncoderHeader(kind="pca", name="pca", environment=data.task)
-    pca = Encoder(header, data.scaler, *layers)
-    ours, theirs = (held_out_error(each, data, encoder.not_decoded) for each in (encoder, pca))
-    return ours / theirs if theirs > NOTHING else None

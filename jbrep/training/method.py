@@ -106,14 +106,6 @@ class Method(Record, frozen=True, kw_only=True):
         """The largest latent size for an observation of `size` features; None if any will do."""
         return None if cls.min_reduction is None else size - cls.min_reduction
 
-    @classmethod
-    def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
-        """How good an encoder is at what the method is for, in words; empty if that isn't known.
-
-        By the metrics of its header; `latent` is the size of its code.
-        """
-        return ""
-
     @property
     def training(self) -> dict[str, Any]:
         """Its settings as plain JSON; of those that every method has, only what is unusual."""

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -27,16 +26,6 @@ _MIN_BATCH, _MAX_BATCH = 128, 8192
 _BATCHES = 400  # that an epoch should have
 _DRAWN_AT_ONCE = 4  # batches
 _Item = TypeVar("_Item")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Schedule:
-    """How long and how fast to train."""
-
-    epochs: int
-    batch_size: int | None = None  # None: `default_batch_size` of the training rows
-    learning_rate: float
-    seed: int = 0  # of order and noise
 
 
 def default_batch_size(rows: int) -> int:
@@ -89,7 +78,7 @@ class Trainer:
     def __init__(
         self,
         objective: Objective,
-        schedule: "Schedule | Learned",
+        schedule: "Learned",
         windows: Windows,
         watched: Windows,
     ):
