@@ -67,7 +67,7 @@ def agent_on_jbrep() -> Any:
     torch.set_num_threads(1)
     preset = get_preset("paper", "ddpg")
     task = describe(TASK)
-    environment = make_env(task, preset.num_envs, 0, find("full", task))
+    environment = make_env(task, preset, 0, find("full", task))
     return make_agent("ddpg", preset, environment, 0).learn(4 * STEPS)
 
 

@@ -42,7 +42,7 @@ SHORT = Run.of(algorithm="a2c", encoder="dae-8", steps=80, **QUICK, preset="pape
 
 def agent_of(algorithm, preset="paper", encoder="dae-8"):
     settings = get_preset(preset, algorithm)
-    env = make_env(TASK, settings.num_envs, 0, find(encoder, TASK))
+    env = make_env(TASK, settings, 0, find(encoder, TASK))
     return make_agent(algorithm, settings, env, seed=0)
 
 
@@ -169,7 +169,9 @@ def test_training_starts_from_these_seeds_whatever_the_agent_seeds(tmp_path, mon
     reset, starts = VecMonitor.reset, []
     monkeypatch.setattr(VecMonitor, "reset", lambda env: starts.append(reset(env)) or starts[-1])
     train(SHORT.replace(seed=3), tmp_path / "run")
-    expected = make_env(TASK, 8, training_seed(3), find("dae-8", TASK)).venv.reset()
+    expected = make_env(
+        TASK, get_preset("paper", "a2c"), training_seed(3), find("dae-8", TASK)
+    ).venv.reset()
     assert [np.array_equal(start, expected) for start in starts if len(start) == 8] == [True]
 
 

@@ -105,7 +105,8 @@ def test_the_units_of_actions_do_not_matter(algorithm, short_rollouts, tmp_path)
 def test_evaluations_are_in_the_order_of_their_starts():
     """Episodes of different lengths end in another order."""
     encoder = find("full", HOPPER)
-    agent = make_agent("sac", get_preset("modern", "sac"), make_env(HOPPER, 1, 0, encoder), 0)
+    chosen = get_preset("modern", "sac")
+    agent = make_agent("sac", chosen, make_env(HOPPER, chosen, 0, encoder), 0)
     together, alone = (evaluate(agent, Lanes(HOPPER, n), encoder, 4).returns for n in (4, 1))
     assert len(set(together.round(3))) == 4
     np.testing.assert_allclose(together, alone, rtol=1e-4)
@@ -114,7 +115,8 @@ def test_evaluations_are_in_the_order_of_their_starts():
 def test_training_is_told_of_terminations(tmp_path):
     """It must not take the value of a state after which an episode ended for good."""
     encoder = find("full", HOPPER)
-    agent = make_agent("sac", get_preset("modern", "sac"), make_env(HOPPER, 1, 0, encoder), 0)
+    chosen = get_preset("modern", "sac")
+    agent = make_agent("sac", chosen, make_env(HOPPER, chosen, 0, encoder), 0)
     agent.learn(200)
     buffer = agent.replay_buffer
     assert buffer.dones[:200].any()

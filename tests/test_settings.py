@@ -44,7 +44,7 @@ SAC_RUN = Run.of(**QUICK, overrides={**SMALL, "normalize": True})
 
 def agent_of(algorithm, overrides, preset="modern"):
     chosen = overridden(algorithm, preset, overrides)
-    env = make_env(TASK, chosen.num_envs, 0, find("full", TASK), normalize=chosen.normalize)
+    env = make_env(TASK, chosen, 0, find("full", TASK))
     return make_agent(algorithm, chosen, env, 0)
 
 
@@ -188,7 +188,7 @@ def resumed(run, folder, stop_at=30):
         ("crossq", {**SMALL, "renorm_warmup_steps": 2}),
         (
             "ppo",
-            {"n_steps": 10, "batch_size": 20, "num_envs": 2, "use_sde": True, "normalize": True},
+            {"n_steps": 10, "batch_size": 20, "num_envs": 2, "normalize": True},
         ),
     ],
 )

@@ -1,7 +1,6 @@
 """What is seen of an environment that gives more: some of its features, and their history."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from copy import copy
 from typing import Any
 
 import numpy as np
@@ -67,12 +66,6 @@ class Window:
     def _seen(self) -> Array:
         n = len(self._states)
         return np.hstack((self._states.reshape(n, -1), self._actions.reshape(n, -1)))
-
-    def copy(self) -> "Window":
-        """Another one, which goes on by itself."""
-        other = copy(self)
-        other._states, other._actions = self._states.copy(), self._actions.copy()
-        return other
 
 
 class Seen:

@@ -51,26 +51,23 @@ ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
 
 def make_env(
     task: Task,
-    num_envs: int,
+    chosen: Hyperparameters,
     seed: int,
     encoder: BaseEncoder,
-    *,
-    normalize: bool = False,
-    num_threads: int = 1,
-    action_repeat: int = 1,
+    threads: int = 1,
     retries: int = 0,
 ) -> VecEnv:
-    """Lanes of a task seen through an encoder, stepped on so many threads."""
+    """Lanes of a task seen through an encoder, as hyperparameters say, stepped on threads."""
     lanes = JitterbugVecEnv(
         task,
-        num_envs,
+        chosen.num_envs,
         seed,
         encoder,
-        num_threads=num_threads,
-        action_repeat=action_repeat,
+        num_threads=min(threads, chosen.num_envs),
+        action_repeat=chosen.action_repeat,
         retries=retries,
     )
-    return normalized(VecMonitor(lanes)) if normalize else VecMonitor(lanes)
+    return normalized(VecMonitor(lanes)) if chosen.normalize else VecMonitor(lanes)
 
 
 def one_line(told: object) -> str:
@@ -163,11 +160,8 @@ class ColouredActionNoise(ActionNoise):
 
     def __init__(self, beta: float, sigma: float, size: int, steps: int):
         super().__init__()
-        self._beta, self._sigma, self._shape = (
-            beta,
-            sigma,
-            (size, max(steps, 2)),
-        )  # fewer have no spectrum
+        self._beta, self._sigma = beta, sigma
+        self._shape = size, max(steps, 2)  # fewer have no spectrum
         self.ahead: NDArray[np.float64]
         self.reset()
 
@@ -286,11 +280,10 @@ def statistics_of(agent: BaseAlgorithm) -> Statistics | None:
     return Statistics.of(env) if env else None
 
 
-def restore_statistics(agent: BaseAlgorithm, tensors: Tensors, source: object) -> None:
+def restore_statistics(agent: BaseAlgorithm, tensors: Tensors) -> None:
     """Let an agent that normalises go on from the statistics among tensors."""
     if env := agent.get_vec_normalize_env():
-        (size,) = agent.observation_space.shape or ()
-        Statistics.read(tensors, size, source).give(env)
+        Statistics.read(tensors).give(env)
 
 
 def evaluate(agent: BaseAlgorithm, lanes: Lanes, encoder: BaseEncoder, episodes: int) -> Outcome:

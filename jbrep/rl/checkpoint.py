@@ -14,7 +14,6 @@ from msgspec import Meta
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.noise import (
     ActionNoise,
     OrnsteinUhlenbeckActionNoise,
@@ -31,7 +30,6 @@ from jbrep.records.record import Version
 from jbrep.records.storage import exists
 from jbrep.rl.agent import (
     ColouredActionNoise,
-    acting,
     parameters,
     restore_statistics,
     statistics_of,
@@ -49,7 +47,6 @@ _MEMORIES: dict[type, str] = {  # of noises that depend on what was drawn before
     ColouredActionNoise: "ahead",
 }
 _UNSCALED = "_last_original_obs"  # before it was normalised
-_EXPLORATION = ("exploration_mat", "exploration_matrices")
 _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
@@ -233,8 +230,6 @@ def _take(agent: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
     tensors |= {"torch": torch.get_rng_state().numpy(), "numpy": np.asarray(keys)}
     if agent.device.type == "cuda":
         tensors["cuda"] = torch.cuda.get_rng_state().numpy()
-    if noise := _state_dependent_noise(agent):
-        tensors |= {name: getattr(noise, name).numpy(force=True) for name in _EXPLORATION}
     counters: dict[str, Any] = {name: getattr(agent, name) for name in _COUNTERS}
     counters |= {
         "numpy": (kind, position, has_gauss, gauss),
@@ -251,7 +246,7 @@ def _restore(agent: BaseAlgorithm, tensors: Tensors, counters: Mapping[str, Any]
     with torch.no_grad():
         for name, tensor in parameters(agent):
             tensor.copy_(torch.from_numpy(tensors[f"{PARAMETERS}{name}"]))
-    restore_statistics(agent, tensors, "the checkpoint")
+    restore_statistics(agent, tensors)
     for name in _COUNTERS:
         setattr(agent, name, int(counters[name]))
     agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
@@ -267,26 +262,11 @@ def _restore(agent: BaseAlgorithm, tensors: Tensors, counters: Mapping[str, Any]
         setattr(*place, tensors[name])
     vec_env(agent).restore(without(_LANES, tensors))
     agent.action_space.np_random.bit_generator.state = counters["action_space"]
-    restore_draws(agent, tensors)
-    kind, *rest = counters["numpy"]
-    np.random.set_state((kind, tensors["numpy"], *rest))  # noqa: NPY002
-
-
-def restore_draws(agent: BaseAlgorithm, tensors: Tensors) -> None:
-    """Bring torch's generator, and what was drawn from it last, to where they were."""
     torch.set_rng_state(torch.from_numpy(tensors["torch"]))
     if agent.device.type == "cuda":
         torch.cuda.set_rng_state(torch.from_numpy(tensors["cuda"]))
-    if noise := _state_dependent_noise(agent):
-        for name in _EXPLORATION:
-            setattr(noise, name, torch.from_numpy(tensors[name]).to(agent.device))
-
-
-def draw_noise(agent: BaseAlgorithm) -> None:
-    """Draw state-dependent noise, if there is any, as the next rollout would at its start."""
-    if _state_dependent_noise(agent):
-        policy: Any = acting(agent.policy)
-        policy.reset_noise(agent.n_envs)
+    kind, *rest = counters["numpy"]
+    np.random.set_state((kind, tensors["numpy"], *rest))  # noqa: NPY002
 
 
 def _arrays(agent: BaseAlgorithm) -> dict[str, tuple[object, str]]:
@@ -304,12 +284,6 @@ def _arrays(agent: BaseAlgorithm) -> dict[str, tuple[object, str]]:
         "returns": (monitor, "episode_returns"),
         "lengths": (monitor, "episode_lengths"),
     }
-
-
-def _state_dependent_noise(agent: BaseAlgorithm) -> StateDependentNoiseDistribution | None:
-    """The distribution that explores by noise on features, with use_sde."""
-    distribution = getattr(acting(agent.policy), "action_dist", None)
-    return distribution if isinstance(distribution, StateDependentNoiseDistribution) else None
 
 
 def vec_env(agent: BaseAlgorithm) -> JitterbugVecEnv:

@@ -18,7 +18,7 @@ from jbrep.encoders.encoder import Encoder, load
 from jbrep.encoders.layers import ACTIVATIONS, ONNX, Layer, activate, dense, run
 from jbrep.envs.recording import held
 from jbrep.envs.view import Window
-from jbrep.errors import DamageError, InputError, choose, first_line, listed
+from jbrep.errors import InputError, choose, listed
 from jbrep.records.container import Tensors, without
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists, taken, write_new
@@ -73,11 +73,6 @@ class Acting(NamedTuple):
         action = chosen.clip(-1, 1) * half + centre
         library = library_of(action)
         return library.minimum(library.maximum(action, self.low), self.high)  # despite rounding
-
-
-class _Seen(NamedTuple):
-    observation: NDArray[np.float32]  # with its history, if the policy was trained with one
-    window: Window | None  # that the history is from
 
 
 class Controller:
@@ -136,8 +131,7 @@ class Controller:
         """The action (k,) at an observation (d,) in the units of the task's features, less offsets.
 
         Several robots may be given at once, (n, d), for (n, k), the same until `reset`. A policy
-        that was trained with a history keeps it: give what the robot shows now. What is refused
-        changes nothing: the next call goes on from the one before.
+        that was trained with a history keeps it: give what the robot shows now.
         """
         try:
             rows = _numbers(observation)
@@ -148,24 +142,22 @@ class Controller:
                 "numbers, none of them masked, in one array, as "
                 "gymnasium.spaces.flatten(env.observation_space, observation) gives them"
             ) from None
-        seen = self._seen(rows)
-        self._held = self._act(seen.observation)
-        self._window = seen.window
+        self._check(rows)
+        self._held = self._act(self._with_history(rows))
         return self._held.copy()
 
-    def _seen(self, observation: NDArray[np.float32]) -> _Seen:
-        """What follows from an observation; nothing is changed yet."""
-        self._check(observation)
+    def _with_history(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """An observation with its history, if the policy was trained with one."""
         if not self.task.view:
-            return _Seen(observation, None)
+            return observation
         rows = np.atleast_2d(observation)
         if self._window is None or self._held is None:
-            window = Window(self.task, len(rows), range(len(self.task.view.places)))
-            seen = window.begin(range(len(rows)), rows)
+            self._window = Window(self.task, len(rows), range(len(self.task.view.places)))
+            seen = self._window.begin(range(len(rows)), rows)
         else:
-            window, taken = self._window.copy(), np.atleast_2d(self._held)
-            seen = window.step(np.ones(len(rows), np.bool_), taken, rows)
-        return _Seen(seen.reshape(*observation.shape[:-1], -1).astype(np.float32), window)
+            moved = np.ones(len(rows), np.bool_)
+            seen = self._window.step(moved, np.atleast_2d(self._held), rows)
+        return seen.reshape(*observation.shape[:-1], -1).astype(np.float32)
 
     def _check(self, observation: NDArray[np.float32]) -> None:
         shape, view, size = observation.shape, self.task.view, self.task.size
@@ -205,8 +197,6 @@ def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[La
         weights: of the part that acts, by stable-baselines3's names.
     """
     shape = settings.hyperparameters
-    if shape.algorithm_kwargs.get("use_sde") or shape.policy_kwargs.get("use_sde"):
-        raise InputError("a policy with use_sde isn't a chain of layers: it can't be taken out")
     activation = str(shape.policy_kwargs.get("activation_fn")).replace("_", "-")
     choose(activation, ACTIVATIONS, "activation")
     parts = [part for prefix in _HIDDEN for part in _numbered(prefix, weights)]
@@ -226,10 +216,6 @@ def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[La
             deviation = np.sqrt(tensors["ra_var"].astype(np.float64) + _RENORM_EPSILON)
             factor = tensors["scale"] / deviation
             shift = tensors["bias"] - tensors["ra_mean"] * factor
-    if layers[-1].units != settings.environment.action_size:
-        raise InputError(
-            f"the policy doesn't fit the run's settings: it gives {layers[-1].units} actions"
-        )
     return (*layers[:-1], layers[-1]._replace(activation="linear"))
 
 
@@ -272,21 +258,9 @@ def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
     if encoder.fingerprint != settings.encoder:
         raise InputError(f"{file.path} is of a run on another encoder than {encoder.name}")
     encoder.check_task(settings.environment)
-    if not all(np.isfinite(values).all() for values in weights.values()):
-        raise DamageError(f"{file.path} is damaged: the policy's weights are not finite")
     normalized = settings.hyperparameters.normalize
-    size = encoder.latent_size
-    statistics = Statistics.read(file.tensors, size, file.path) if normalized else None
-    try:
-        return Controller(settings, encoder, weights, statistics)
-    except KeyError as error:
-        raise InputError(f"{file.path} doesn't fit the run's settings: it has no {error}") from None
-    except InputError:
-        raise
-    except ValueError as error:  # of shapes, or of numbers in names
-        raise InputError(
-            f"{file.path} doesn't fit the run's settings: {first_line(error)}"
-        ) from None
+    statistics = Statistics.read(file.tensors) if normalized else None
+    return Controller(settings, encoder, weights, statistics)
 
 
 def export(controller: Controller, path: Path, form: str = "onnx") -> None:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.envs.task import Array
-from jbrep.errors import DamageError
 
 if TYPE_CHECKING:
     from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -46,19 +45,9 @@ class Statistics:
         return cls(running.mean, running.var, float(running.count))
 
     @classmethod
-    def read(cls, tensors: Mapping[str, NDArray[Any]], size: int, source: object) -> "Statistics":
-        """Those of `size` numbers that `tensors` gave, among others; the source is for messages."""
-        checked = []
-        for name, shape in {"mean": (size,), "variance": (size,), "count": ()}.items():
-            values = np.asarray(tensors.get(_PREFIX + name))
-            sound = values.shape == shape and values.dtype == np.float64
-            if not sound or not np.isfinite(values).all() or (name != "mean" and values.min() < 0):
-                raise DamageError(
-                    f"{source} is damaged: the {name} of the {size} numbers that the policy sees "
-                    "is missing or invalid"
-                )
-            checked.append(values)
-        mean, variance, count = checked
+    def read(cls, tensors: Mapping[str, NDArray[Any]]) -> "Statistics":
+        """Those that `tensors` gave, among others."""
+        mean, variance, count = (tensors[_PREFIX + name] for name in _KEPT)
         return cls(mean, variance, float(count))
 
     @property

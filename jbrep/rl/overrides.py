@@ -31,7 +31,7 @@ _MOST_BYTES = 1 << 27  # of networks; the rest is for observations and an encode
 _ANY_SPACES = (spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-1, 1, (1,), np.float32))
 _RANGES: dict[str, tuple[float, float]] = {  # others: from 1 if whole, else from 0
     **dict.fromkeys(("gamma", "tau", "gae_lambda", "batch_norm_momentum"), (0, 1)),
-    **dict.fromkeys(("gradient_steps", "sde_sample_freq"), (-1, _MOST)),
+    "gradient_steps": (-1, _MOST),
     **dict.fromkeys(("learning_starts", "top_quantiles_to_drop_per_net"), (0, _MOST)),
     "renorm_warmup_steps": (0, _MOST),
     "target_entropy": (-_MOST, _MOST),
@@ -70,9 +70,11 @@ _REFUSED = {  # arguments that are jbrep's own, with the reason
         ),
         "a checkpoint needs the usual buffer",
     ),
+    **dict.fromkeys(
+        ("use_sde", "sde_sample_freq", "use_sde_at_warmup"), "a checkpoint has no noise on features"
+    ),
 }
-_NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "use_sde", "net_arch"}
-_SHAPING = "use_sde"  # the argument of algorithms that decides which weights a policy has
+_NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "net_arch"}
 
 
 def overridden(algorithm: str, preset: str, overrides: Mapping[str, Any]) -> Hyperparameters:
@@ -126,11 +128,10 @@ def setting_names(algorithm: str) -> list[str]:
 
 def check_shape(algorithm: str, hyperparameters: Hyperparameters) -> Hyperparameters:
     """Those of hyperparameters, perhaps a stranger's, that decide which weights a policy has."""
-    of_class = hyperparameters.algorithm_kwargs
     _check_parts(algorithm, hyperparameters.net_arch)
     return Hyperparameters(
         hyperparameters.net_arch,
-        {_SHAPING: of_class[_SHAPING] is True} if _SHAPING in of_class else {},
+        {},
         policy_kwargs={
             name: _of_policy(algorithm, name, value)
             for name, value in hyperparameters.policy_kwargs.items()

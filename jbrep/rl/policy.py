@@ -99,8 +99,7 @@ class Trained(NamedTuple):
         fill(acting(self.policy), weights, source)
         if self.statistics is None:
             return self
-        size = self.encoder.latent_size
-        return self._replace(statistics=Statistics.read(tensors, size, source))
+        return self._replace(statistics=Statistics.read(tensors))
 
 
 def _finite(act: Actor) -> Actor:
@@ -284,7 +283,6 @@ def _sizes(settings: RunSettings, latent_size: int) -> dict[str, Any]:
     return {
         "algorithm": settings.algorithm,
         "net_arch": to_plain(shape.net_arch),
-        **shape.algorithm_kwargs,
         **shape.policy_kwargs,
         "normalize": shape.normalize,
         "features": settings.environment.size,

@@ -201,8 +201,7 @@ def _as_told(
     trained = _checked(agent, header.environment, seen, path)
     if not statistics:
         return trained
-    read = Statistics.read(statistics, seen.latent_size, path)
-    return trained._replace(statistics=read)
+    return trained._replace(statistics=Statistics.read(statistics))
 
 
 def _checked(agent: BaseAlgorithm, task: Task, seen: BaseEncoder, path: Path) -> Trained:

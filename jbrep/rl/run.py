@@ -113,14 +113,7 @@ def estimate(run: Run) -> float:
     encoder = run.find_encoder()
     settings = run.settings(encoder)
     chosen, episodes = settings.hyperparameters, run.evaluation_episodes
-    made = make_env(
-        run.task,
-        chosen.num_envs,
-        0,
-        encoder,
-        normalize=chosen.normalize,
-        action_repeat=chosen.action_repeat,
-    )
+    made = make_env(run.task, chosen, 0, encoder)
     with single_torch_thread(), closing(made) as env, ExitStack() as opened:
         agent = make_agent(settings.algorithm, chosen, env, 0, settings.episode_steps)
         learning = _seconds(lambda: agent.learn(_TRIAL))  # whole rollouts, so at least one

@@ -9,7 +9,7 @@ from msgspec import UNSET, UnsetType
 from jbrep.envs.task import Id, Task
 from jbrep.errors import differences
 from jbrep.records.record import Sha256, pattern, to_plain
-from jbrep.rl.presets import ALGORITHMS, Hyperparameters, learns_from
+from jbrep.rl.presets import ALGORITHMS, LINEAR, Hyperparameters, learns_from
 from jbrep.rl.settings import (
     Episodes,
     LearnerName,

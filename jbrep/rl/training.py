@@ -40,8 +40,6 @@ from jbrep.rl.checkpoint import (
     Checkpoint,
     Saver,
     Standing,
-    draw_noise,
-    restore_draws,
     standing,
     vec_env,
 )
@@ -182,21 +180,11 @@ def _train(job: _Job, resumes: bool) -> RunRecord:
 
 @contextmanager
 def _agent(job: _Job) -> Iterator[BaseAlgorithm]:
-    settings, seed = job.settings, training_seed(job.run.seed)
-    chosen = settings.hyperparameters
-    made = make_env(
-        job.run.task,
-        chosen.num_envs,
-        seed,
-        job.encoder,
-        normalize=chosen.normalize,
-        num_threads=min(job.session.threads, chosen.num_envs),
-        action_repeat=chosen.action_repeat,
-        retries=job.session.retries,
-    )
-    steps, device = settings.episode_steps, settings.device
+    settings, seed, session = job.settings, training_seed(job.run.seed), job.session
+    chosen, steps = settings.hyperparameters, settings.episode_steps
+    made = make_env(job.run.task, chosen, seed, job.encoder, session.threads, session.retries)
     with closing(made) as env:
-        agent = make_agent(settings.algorithm, chosen, env, settings.seed, steps, device)
+        agent = make_agent(settings.algorithm, chosen, env, settings.seed, steps, settings.device)
         env.seed(seed)  # stable-baselines3 has given it the agent's
         yield agent
 
@@ -210,7 +198,7 @@ def _begin(agent: BaseAlgorithm, job: _Job, is_new: bool) -> None:
         write_whole(path, read_file(source))
     policy = read(path, sha256)
     fill_whole(policy, agent.policy)
-    restore_statistics(agent, policy.tensors, path)
+    restore_statistics(agent, policy.tensors)
 
 
 def _learn(agent: BaseAlgorithm, steps: int, progress: BaseCallback) -> Exception | None:
@@ -238,7 +226,7 @@ class _Progress(BaseCallback):
     def __init__(self, job: _Job, history: History, checkpoint: Checkpoint | None):
         super().__init__()
         self._job, self._history, self._settings = job, history, job.settings
-        self._checkpoint, self._draws = checkpoint, dict[str, Any]()
+        self._checkpoint = checkpoint
         self._saver = Saver(job.folder, job.settings, versions_of(job.run), job.session.save_every)
         self._lanes: Lanes | None = None  # of evaluations
 
@@ -256,7 +244,6 @@ class _Progress(BaseCallback):
             threads = min(session.threads, episodes)
             self._lanes = lanes_at_once(run.task, episodes, threads, session.retries)
         if self._checkpoint:
-            self._draws = dict(self._checkpoint.tensors)
             self._checkpoint.restore(self.model)
             self._checkpoint = None  # a replay buffer can be large
 
@@ -265,9 +252,6 @@ class _Progress(BaseCallback):
         if not self._history.evaluations:
             self._evaluate(self.model._last_obs)
         self._tell()
-        if self._draws:  # state-dependent noise has just been drawn, for the second time
-            restore_draws(self.model, self._draws)
-            self._draws.clear()
         is_stopping = self._job.session.stop()
         if is_stopping or self._saver.is_due:
             self._saver.write(self.model, self._history)
@@ -324,8 +308,6 @@ class _Progress(BaseCallback):
         check_finite(self.model)
         self._tell()  # the last evaluation can take minutes
         if self._job.session.keep_checkpoint:
-            if not self._draws:  # else nothing was trained since, and it is drawn
-                draw_noise(self.model)
             self._saver.write(self.model, self._history)
         self._history.drop_from(self._settings.steps)  # an evaluation of a run that is kept
         self._play(self._settings.final_episodes)
@@ -340,11 +322,7 @@ class _Progress(BaseCallback):
 
 
 def check_finite(agent: BaseAlgorithm) -> None:
-    """Check the last losses and the policy's weights.
-
-    Raises:
-        DivergedError: one is NaN or infinite.
-    """
+    """Check the last losses and the policy's weights: a DivergedError if one isn't finite."""
     for name, value in agent.logger.name_to_value.items():
         if name.endswith("loss") and not np.isfinite(value):
             raise DivergedError(f"{name} is {value}")
