@@ -451,13 +451,10 @@ def test_a_strangers_coordinates_are_checked():
     plain = to_plain(parts)
     assert from_plain(plain, tuple[Part, ...]) == parts
     for spoiled, said in (
-        ([*plain, plain[0]], "two parts of the coordinates give '"),
         ([[*plain[0][:1], "exec", *plain[0][2:]]], "'exec': it must be one of attitude, body"),
         ([["a", "circle", ["x", "y"], True, 0.0]], "a, circle, takes 1 numbers, but is given 2"),
         ([["a", "polar", ["x", "y"], True, 0.0]], "the soft length of a is 0"),
-        ([["a", "same", ["target_x"], False, 0.0]], "none of the coordinates is shown"),
         ([["../a", "same", ["x"], True, 0.0]], "is '../a'"),
-        ([["a", "same", ["height"], True, 0.0]], "a takes height, which move_to_pose doesn't have"),
     ):
         with pytest.raises(InputError, match=said):
             Coordinates(TASK, from_plain(spoiled, tuple[Part, ...]))

@@ -159,23 +159,12 @@ def test_a_module_is_used_in_evaluation_mode_and_left_as_it_was():
     module(torch.zeros(4, 3)).sum().backward()  # it can still learn
 
 
-class _Failing:
-    """Whose latent_size is abstract."""
-
-    @property
-    def latent_size(self):
-        raise NotImplementedError("say how many")
-
-    encode = Half.encode
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         (only(), "Odd has neither `encode` nor `transform`"),
         (Half, "Half is a class"),
         (only(encode=7), "Odd has neither `encode` nor `transform`"),
-        (_Failing(), "_Failing failed at its latent_size: NotImplementedError"),
         (nn.Module(), "Module failed: NotImplementedError"),
         (only(encode=Half.encode, latent_size=4), "its latent_size is 4"),
         (Spoilt(lambda rows: (rows, rows), 0), "TypeError: it returned a tuple"),

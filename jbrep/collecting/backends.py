@@ -123,7 +123,6 @@ def make_episodes(
 
 
 def _whole(made: Made) -> Iterator[Columns]:
-    """What was made, and then the failure."""
     for each in made:
         if isinstance(each, InputError):
             raise each

@@ -145,7 +145,6 @@ def _begin(wanted: Manifest, folder: Path, files: Mapping[str, bytes]) -> Manife
 
 
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
-    """Check that going on gives what an uninterrupted run gives."""
     steps, own = wanted.settings.steps, there.settings.steps
     before, now = _plain(there.settings), _plain(wanted.settings)
     if before != {**now, "steps": own}:

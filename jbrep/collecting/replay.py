@@ -93,7 +93,6 @@ def simulate_again(
 
 
 def _is_equal(recording: Recording, lane: int, episode: Episode) -> bool:
-    """Whether a lane went through what is stored of an episode, to the last bit."""
     length, stored = len(episode), episode.record
     ends_there = recording.length[lane] == length and bool(recording.terminated[lane])
     if recording.length[lane] < length or ends_there != bool(stored["terminated"]):

@@ -2,7 +2,6 @@
 
 import math
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cached_property
@@ -17,7 +16,6 @@ from jbrep.envs.task import Feature, Task, Word
 from jbrep.errors import InputError
 from jbrep.records.record import Record
 
-_MAX_NUMBERS = 4096
 _FULL_TURN = 2.02 * math.pi  # and what rounding adds
 _PLAIN = SimpleNamespace(sin=math.sin, cos=math.cos, sqrt=math.sqrt, arctan2=math.atan2)
 _Soft = Annotated[float, Meta(ge=0, le=1e12)]
@@ -99,26 +97,7 @@ class Coordinates:
         shown = [part for part in parts if part.shown]
         self.names = tuple(name for part in shown for name in part.gives)
         self.sources = tuple(part.name for part in shown for _ in part.gives)
-        self._check()
         self._way_back = list(self._steps_back())
-
-    def _check(self) -> None:
-        given = [name for part in self.parts for name in part.gives]
-        known = {*self.task.feature_names}
-        if not self.names:
-            raise InputError("none of the coordinates is shown")
-        if len(given) > _MAX_NUMBERS:
-            raise InputError(f"there are {len(given):,} coordinates: the limit is {_MAX_NUMBERS:,}")
-        if twice := [name for name, count in Counter(given).items() if count > 1]:
-            raise InputError(f"two parts of the coordinates give {twice[0]!r}")
-        for part in self.parts:
-            if part.formula != "same" and (own := {*part.gives} & {*self.task.feature_names}):
-                raise InputError(f"{part.name} gives {min(own)}, which is a feature")
-            if missing := [name for name in part.of if name not in known]:
-                raise InputError(
-                    f"{part.name} takes {missing[0]}, which {self.task.name} doesn't have"
-                )
-            known.update(part.gives)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -202,7 +181,6 @@ class Coordinates:
 
 
 def _described(part: Part, of: list[Feature]) -> list[Feature]:
-    """What a part gives, as features."""
     if part.formula == "same":
         return [of[0].replace(name=part.name)]
     of = of[: 2 if part.formula in ("turned", "polar", "difference") else 3]

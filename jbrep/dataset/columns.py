@@ -92,7 +92,6 @@ class Column:
         return f"Column(shape={self.shape}, dtype={self.dtype}, shards={len(self.ends)})"
 
     def _slice(self, rows: range) -> Array:
-        """Consecutive rows: a view of a shard if they are all in one."""
         start, shard = rows.start, bisect_right(self.ends, rows.start)
         parts = []
         while start < rows.stop:
@@ -105,7 +104,6 @@ class Column:
         return np.concatenate(parts) if parts else np.empty((0, *self.row), self.dtype)
 
     def _take(self, rows: NDArray[np.int64]) -> Array:
-        """Rows in any order, copied."""
         flat = rows.ravel()
         taken = np.empty((len(flat), *self.row), self.dtype)
         owner = np.searchsorted(self.ends, flat, side="right")

@@ -133,7 +133,6 @@ class Dataset:
 
     @cached_property
     def _places(self) -> dict[str, int | slice]:
-        """Index in an observation of each group and feature."""
         return self.task.groups | {name: i for i, name in enumerate(self.task.feature_names)}
 
     @cached_property
@@ -276,7 +275,6 @@ def _spread_text(values: Mapping[str, float]) -> str:
 
 
 def _spread(values: Any) -> dict[str, float]:
-    """Quantiles, mean and extrema over the episodes, if there are any."""
     if not len(values):
         return {}
     low, median, high = np.percentile(values, (10, 50, 90))

@@ -5,7 +5,7 @@ import re
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import chain
 from typing import Any
 
@@ -103,8 +103,10 @@ class OwnEncoder(BaseEncoder):
         if isinstance(given, type):
             raise InputError(f"{self.name} is a class: give an object, such as {self.name}()")
         self.given = given
-        self._encode = self._has("encode") or self._has("transform", given)
-        self._decode = self._has("decode") or self._has("inverse_transform")
+        self._encode = getattr(given, "encode", None) or getattr(given, "transform", given)
+        self._decode: Any = getattr(given, "decode", None) or getattr(
+            given, "inverse_transform", None
+        )
         self.can_decode = callable(self._decode)
         if not callable(self._encode):
             raise InputError(
@@ -113,7 +115,7 @@ class OwnEncoder(BaseEncoder):
             )
         latents = self._apply(self._encode, self._probes, None)
         self.latent_size = latents.shape[1]
-        if (declared := self._has("latent_size", self.latent_size)) != self.latent_size:
+        if (declared := getattr(given, "latent_size", self.latent_size)) != self.latent_size:
             raise InputError(
                 f"{self.name} returned latents of {self.latent_size} numbers, but its latent_size "
                 f"is {declared}"
@@ -123,16 +125,8 @@ class OwnEncoder(BaseEncoder):
 
     @property
     def _probes(self) -> Float32:
-        """Observations to try it on, (n, d)."""
         scaled = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, (_PROBES, self.size))
         return self.task.unscale(scaled).astype(np.float32)
-
-    def _has(self, name: str, default: Any = None) -> Any:
-        """An attribute of the user's object, which may be a property that fails."""
-        try:
-            return getattr(self.given, name, default)
-        except Exception as error:
-            raise InputError(f"{self.name} failed at its {name}: {_reason(error)}") from error
 
     def _check_repeats(self, latents: Float32) -> None:
         """Refuse it unless the probes' latents (n, l) come again, in this batch and in another."""
@@ -153,7 +147,7 @@ class OwnEncoder(BaseEncoder):
         return self._in_rows(self._decode, latent, self.latent_size, self.size)
 
     def check_task(self, task: Task) -> None:
-        if check := self._has("check_task"):
+        if check := getattr(self.given, "check_task", None):
             with refusing(f"{self.name} refuses {task.name}", told=_reason):
                 check(task)
         elif task.size != self.size:
@@ -163,7 +157,6 @@ class OwnEncoder(BaseEncoder):
             )
 
     def _in_rows(self, function: Callable[..., Any], values: Any, size: int, width: int) -> Float32:
-        """Apply a function of rows to values (..., size), giving (..., width)."""
         values = np.asarray(values, np.float32)
         if not values.ndim or values.shape[-1] != size:
             raise InputError(
@@ -198,7 +191,7 @@ class OwnEncoder(BaseEncoder):
             like = next((t for t in tensors if t.is_floating_point()), torch.empty(0))
             with _evaluating(self.given), torch.no_grad():
                 return function(torch.from_numpy(rows).to(like.device, like.dtype))
-        names = self._has("feature_names_in_")
+        names = getattr(self.given, "feature_names_in_", None)
         if pandas and names is not None and function is self._encode:
             return function(pandas.DataFrame(rows, columns=names))  # as it was fitted
         return function(rows)
@@ -206,7 +199,6 @@ class OwnEncoder(BaseEncoder):
 
 @contextmanager
 def _evaluating(module: Any) -> Iterator[None]:
-    """A torch module in evaluation mode; afterwards each of its parts is as it was."""
     training = [part for part in module.modules() if part.training]
     for part in training:
         part.training = False
@@ -218,12 +210,9 @@ def _evaluating(module: Any) -> Iterator[None]:
 
 
 def _name(given: Any) -> str:
-    """What tables call a user's object: its name, if that is a word, else its class's."""
-    for attribute in ("name", "__name__"):
-        with suppress(Exception):  # of a property that fails
-            name = getattr(given, attribute)
-            if isinstance(name, str) and _NAME.fullmatch(name):
-                return name
+    for name in (getattr(given, "name", None), getattr(given, "__name__", None)):
+        if isinstance(name, str) and _NAME.fullmatch(name):
+            return name
     return type(given).__name__
 
 

@@ -5,7 +5,6 @@ from typing import Any
 
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder, Layers
-from jbrep.envs.task import Feature
 from jbrep.text import facts, table
 
 _RECORDS = ("training", "data", "metrics", "versions")
@@ -26,7 +25,8 @@ def describe(encoder: BaseEncoder, source: str) -> dict[str, Any]:
     }
     if not isinstance(encoder, Encoder):
         return {**told, "decodes": encoder.can_decode, "sha256": encoder.fingerprint}
-    ranges = zip(_read(encoder), encoder.scaler.low, encoder.scaler.high, strict=True)
+    features = encoder.scaler.features(encoder.task)
+    ranges = zip(features, encoder.scaler.low, encoder.scaler.high, strict=True)
     return {
         **told,
         "encoder": _layers(encoder.encoder),
@@ -41,51 +41,28 @@ def describe(encoder: BaseEncoder, source: str) -> dict[str, Any]:
 
 
 def card(encoder: BaseEncoder, source: str, width: int) -> str:
-    """A few lines on an encoder; of a file, also the range of each feature, scaled to [-1, 1]."""
+    """The same in lines; of a file, also the range of each feature, scaled to [-1, 1]."""
     told = describe(encoder, source)
-    lines = {
-        "source": source,
-        "task": f"{told['task']}, {told['size']} features to {told['latent_size']}",
-        "environment": ", ".join([encoder.task.id, *encoder.task.given_arguments]),
-        "kind": told["kind"],
-    }
-    if not isinstance(encoder, Encoder):
-        decodes = "yes" if encoder.can_decode else "no"
-        return f"{encoder.name}\n{facts({**lines, 'decodes': decodes}, width)}"
-    if coordinates := encoder.scaler.coordinates:
-        lines["encodes"] = f"{len(coordinates)} coordinates of the features"
-    lines |= {
-        "encoder": _shape(encoder.scaler.size, told["encoder"]),
-        "decoder": _shape(encoder.latent_size, told["decoder"]) if encoder.can_decode else "none",
-        **{name: _listed(told[name]) for name in _RECORDS if told[name]},
-        "sha256": told["sha256"],
-    }
-    rows = [
-        (str(feature), f"{f['low']:.4g}", f"{f['high']:.4g}")
-        for feature, f in zip(_read(encoder), told["features"], strict=True)
-    ]
-    return f"{encoder.name}\n{facts(lines, width)}\n\n{table(('feature', 'low', 'high'), rows)}"
-
-
-def _read(encoder: Encoder) -> tuple[Feature, ...]:
-    return encoder.scaler.features(encoder.task)
+    features = told.pop("features", ())
+    for part in ("encoder", "decoder"):
+        if part in told:
+            layers = (f"{layer['units']} {layer['activation']}" for layer in told[part])
+            told[part] = " -> ".join(layers) or "none"
+    named = {name: _said(value) for name, value in told.items() if value not in ({}, encoder.name)}
+    text = f"{encoder.name}\n{facts(named, width)}"
+    rows = [(f["name"], f["unit"], f"{f['low']:.4g}", f"{f['high']:.4g}") for f in features]
+    return f"{text}\n\n{table(('feature', 'unit', 'low', 'high'), rows)}" if rows else text
 
 
 def _layers(layers: Layers) -> list[dict[str, Any]]:
     return [{"units": layer.units, "activation": layer.activation} for layer in layers]
 
 
-def _shape(size: int, layers: list[dict[str, Any]]) -> str:
-    """As 16 -> 128 relu -> 8 tanh."""
-    return " -> ".join(
-        [str(size), *(f"{layer['units']} {layer['activation']}" for layer in layers)]
-    )
-
-
-def _listed(record: Mapping[str, Any]) -> str:
-    """As latent 8, policy (kind uniform)."""
-    return ", ".join(f"{name} {_said(value)}" for name, value in record.items()) or "none"
-
-
 def _said(value: Any) -> str:
-    return f"({_listed(value)})" if isinstance(value, Mapping) else str(value)
+    """As latent 8, policy (kind uniform)."""
+    if not isinstance(value, Mapping):
+        return str(value)
+    parts = (
+        f"{n} ({_said(v)})" if isinstance(v, Mapping) else f"{n} {v}" for n, v in value.items()
+    )
+    return ", ".join(parts)

@@ -163,7 +163,6 @@ def _check_alone(model: ModelProto) -> None:
 
 
 def _messages(message: Message) -> Iterator[Message]:
-    """A message of protobuf, and all that are in it."""
     yield message
     for field, value in message.ListFields():
         if field.message_type:

@@ -135,7 +135,6 @@ ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {  # for NumPy arrays
 
 @cache
 def _torch() -> Mapping[str, Callable[[Any], Any]]:
-    """The same for torch tensors."""
     import torch
     from torch.nn import functional
 

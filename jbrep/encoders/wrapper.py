@@ -92,7 +92,6 @@ class Encoded:
         return spaces.Box(-np.inf, np.inf, (self.encoder.latent_size,), np.float32)
 
     def _encode(self, rows: NDArray[Any]) -> Float32:
-        """The latents (n, l) of what an environment gave, (n, d)."""
         return self.encoder.encode((rows - self.task.offset).astype(np.float32))
 
 
@@ -149,7 +148,6 @@ class EncodedVectorEnv(Encoded, VectorWrapper[Float32, Any, Any, Any, Any]):
         return represented
 
     def _rows(self, observation: Any) -> NDArray[Any]:
-        """Observations of all lanes as flat rows, (n, d)."""
         if isinstance(self.env.single_observation_space, spaces.Box):
             return observation.reshape(len(observation), -1)
         each = iterate(self.env.observation_space, observation)

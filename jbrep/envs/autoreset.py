@@ -143,7 +143,6 @@ class AutoresetLanes:
 
 
 def _episode_seed(first: int, episode: int) -> int:
-    """The seed of a lane's episode, from that of its first and the number of episodes before."""
     if episode == 0:
         return first
     return int(np.random.SeedSequence([first, episode]).generate_state(1)[0]) >> 1

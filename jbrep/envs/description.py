@@ -197,7 +197,6 @@ def spread(task: Task) -> tuple[float, ...]:
 
 @lru_cache(maxsize=8)
 def _spread(plain: str) -> tuple[float, ...]:
-    """That of a task in JSON."""
     task = from_plain(json.loads(plain), Task)
     several = _SPREAD_EPISODES if is_batched(task) else 1
     low, high = task.action_low, task.action_high

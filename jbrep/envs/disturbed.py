@@ -87,7 +87,6 @@ class Disturbed:
         return np.where(noise > 0, noisy, given)
 
     def _late(self, values: Array, name: str) -> Array:
-        """Those of so many steps before, (n, ...), as the episode has drawn."""
         return values[np.arange(len(values)), self._drawn[name].astype(np.int64)]
 
 

@@ -62,7 +62,6 @@ def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv
 
 @contextmanager
 def _making(env_id: str, arguments: Mapping[str, Any]) -> Iterator[None]:
-    """Say in a line why an environment can't be made."""
     given = f" with {dict(arguments)}" if arguments else ""
     with refusing(f"can't make {env_id}{given}"), _quiet(), aside():
         yield

@@ -152,7 +152,6 @@ def _bounds(space: spaces.Box) -> tuple[Array, Array]:
 
 
 def _below(bound: NDArray[Any]) -> Array:
-    """The largest numbers up to the bounds that 32 bits can hold, flat."""
     single = bound.astype(np.float32)
     lower = np.nextafter(single, np.float32(-np.inf))
     return np.where(single > bound, lower, single).astype(np.float64)
@@ -184,7 +183,6 @@ def features_of(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
 
 
 def _parts(name: str, space: spaces.Space[Any]) -> Iterator[tuple[str, spaces.Space[Any]]]:
-    """The spaces that dictionaries and tuples consist of, in the order of flattening."""
     if isinstance(space, spaces.Dict):
         items = [*space.spaces.items()]
     elif isinstance(space, spaces.Tuple):

@@ -384,7 +384,6 @@ def _check_groups(features: Sequence[Feature]) -> None:
 
 
 def _usual_range(feature: Feature) -> tuple[float, float]:
-    """That of a feature, or one by which it isn't scaled."""
     low, high = feature.low, feature.high
     return (low, high) if low is not None and high is not None and low < high else (-1.0, 1.0)
 

@@ -233,5 +233,4 @@ def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
 
 
 def _inverse(values: Array, kept: NDArray[np.bool_]) -> Array:
-    """1 / values of those that are kept, 0 of the others, (n,)."""
     return np.divide(1, values, out=np.zeros(len(values)), where=kept)

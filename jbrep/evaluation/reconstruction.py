@@ -55,7 +55,6 @@ def errors(e: Judged) -> tuple[Score | None, Score | None]:
 
 
 def _means(sums: Array) -> Array:
-    """Sums over each group of the means over features, (groups, 1), from those of each."""
     return sums.mean(axis=1, keepdims=True)
 
 

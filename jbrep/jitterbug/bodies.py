@@ -98,7 +98,6 @@ def draw(number: int, materials: bool = False) -> Body:
 
 
 def _draw(number: int, random: np.random.Generator) -> Body:
-    """A body of the published materials."""
     return Body(
         number,
         materials=False,

@@ -256,7 +256,6 @@ class Simulation:
 
     @cached_property
     def _scratch(self) -> mujoco.MjData:
-        """Of the sizes that all bodies' fast models have."""
         return mujoco.MjData(self._models[0])
 
     def push(self, velocity: Array) -> None:

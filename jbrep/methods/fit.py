@@ -140,7 +140,6 @@ class Fitter:
         return self._data.rescaled(method.scaling, coordinates, method.clip, method.keep)
 
     def _make_once(self, plan: Plan) -> bool:
-        """Make it unless another process has made it meanwhile; whether it did."""
         make_folder(self._folder)
         with exclusive(plan.path, beside=True):
             if plan.is_complete():
@@ -200,7 +199,6 @@ class Fitter:
             self._save(plan, Made(*objective.layers(), metrics))
 
     def _save(self, plan: Plan, made: Made) -> None:
-        """Write the file, with the error on all held-out rows among its metrics."""
         method, data = plan.method, plan.data
         parts = complete(made, data, method.codes, method.keep)
         encoder = Encoder(plan.header, data.scaler, *parts)
@@ -267,7 +265,6 @@ def complete(
 
 
 def _code_moments(layers: Layers, data: ScaledDataset) -> tuple[Moments, Array]:
-    """Moments of the code over the training rows, and its covariance with the rows, (l, size)."""
     size = len(layers[-1].bias)
     total, products = np.zeros(size), np.zeros((size, size + data.size))
     for rows in data.chunks(data.train):
@@ -281,7 +278,6 @@ def _code_moments(layers: Layers, data: ScaledDataset) -> tuple[Moments, Array]:
 
 
 def _best_decoder(moments: Moments, shared: Array, data: ScaledDataset) -> Layer:
-    """The linear map from the code to the row with the least squared error."""
     weight = shared.T @ np.linalg.pinv(moments.covariance, hermitian=True)
     return dense(weight, data.moments.mean - weight @ moments.mean)
 

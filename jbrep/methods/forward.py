@@ -87,7 +87,6 @@ class LinearForward(Directions, frozen=True, kw_only=True):
         return direction_code(left[:, : self.latent].T @ whiten, here, singular)
 
     def _scales(self, data: ScaledDataset) -> Array:
-        """The standard deviation that each target is brought to, (t,)."""
         sizes = data.size, data.size, 1
         once = [
             np.full(n, np.sqrt(weight * data.size / n))
@@ -301,7 +300,6 @@ class ForwardObjective(Objective):
         yield from map(_Batch, *parts)
 
     def _errors(self, batch: _Batch, code: Tensor) -> Tensor:
-        """Squared errors from codes (n, l), averaged over rows, (horizons, targets)."""
         predicted = self.predictors(torch.cat((code.T, batch.actions)))
         return (predicted - batch.targets).square().mean(2)
 

@@ -93,7 +93,6 @@ class DeepMDPObjective(Objective):
         return *windows.steps(numbers), rewards[:, None]
 
     def _errors(self, batch: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        """The terms of the loss, by the names of their weights."""
         now, actions, after, rewards = batch
         code, following = self.encoder(torch.cat((now, after))).chunk(2)
         known = torch.cat((code, actions), 1)

@@ -175,7 +175,6 @@ def _at(
 
 
 def _choices(nodes: Sequence[inspect.Type], before: str) -> str:
-    """The values, or else the names of fields, among which there is a choice, after some words."""
     values = [each for node in nodes for each in getattr(node, "values", ())]
     fields = (each for node in nodes for each in getattr(node, "fields", ()))
     choices = ", ".join(map(str, values or dict.fromkeys(f.encode_name for f in fields)))
@@ -198,7 +197,6 @@ def to_plain(value: Any) -> Any:
 
 
 def _of_python(value: Any) -> Any:
-    """A NumPy scalar as Python's; anything else as it is."""
     return value.item() if hasattr(value, "dtype") and not getattr(value, "shape", 0) else value
 
 

@@ -178,7 +178,6 @@ class ColouredActionNoise(ActionNoise):
 
 
 def _noise(chosen: Any, size: int, steps: int) -> ActionNoise:
-    """The noise of one environment, on `size` numbers, for episodes of so many steps."""
     match chosen:
         case NormalNoise(sigma=sigma):
             return NormalActionNoise(np.zeros(size), np.full(size, sigma))

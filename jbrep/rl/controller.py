@@ -147,7 +147,6 @@ class Controller:
         return self._held.copy()
 
     def _with_history(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """An observation with its history, if the policy was trained with one."""
         if not self.task.view:
             return observation
         rows = np.atleast_2d(observation)
@@ -220,7 +219,6 @@ def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[La
 
 
 def _numbered(prefix: str, weights: Tensors) -> list[Tensors]:
-    """The tensors of each layer of a sequence that has some, in order."""
     parts: dict[int, Tensors] = {}
     for name, values in without(prefix, weights).items():
         number, _, what = name.partition(".")

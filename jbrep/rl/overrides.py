@@ -169,7 +169,6 @@ def _parameters(algorithm: str) -> dict[str, Any]:
 
 @cache
 def _policy_parameters(algorithm: str) -> dict[str, Any]:
-    """The same for its policy's class."""
     left_out = {*_NOT_OF_POLICIES, *_REFUSED, *_OWN}
     _, of_policy = parameters_of(algorithm)
     types = {name: each.annotation for name, each in of_policy.items() if name not in left_out}

@@ -240,7 +240,6 @@ def load_untrained(folder: Path) -> Trained:
 
 
 def _untrained(folder: Path, settings: RunSettings, given: Any) -> Trained:
-    """What a run trains, as it begins unless another run's policy comes along."""
     with single_torch_thread():  # as in training, so that a module computes the same bits
         if given is None:
             encoder = run_encoder(folder, settings)

@@ -238,7 +238,6 @@ def _check_observations(space: spaces.Space[Any], seen: BaseEncoder, path: Path)
 
 
 def _check_actions(space: spaces.Space[Any], task: Task, path: Path) -> None:
-    """Make sure that the policy's actions are in the task's bounds, or scaled to [-1, 1]."""
     low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
     if isinstance(space, spaces.Box) and space.shape == low.shape:
         own = (space.low, low), (space.high, high)

@@ -202,7 +202,6 @@ def _begin(agent: BaseAlgorithm, job: _Job, is_new: bool) -> None:
 
 
 def _learn(agent: BaseAlgorithm, steps: int, progress: BaseCallback) -> Exception | None:
-    """Train up to that step; why training failed, if it did."""
     try:
         with unchecked_distributions():
             agent.learn(steps, callback=progress)

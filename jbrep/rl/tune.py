@@ -129,7 +129,6 @@ def _claim(path: Path, search: Search) -> None:
 
 
 def _space(run: Run) -> dict[str, BaseDistribution]:
-    """What is searched: the settings that the algorithm has and the run doesn't set."""
     there, given = setting_names(run.learner.algorithm), {*run.learner.overrides}
     if "gradient_steps" in run.learner.hyperparameters.algorithm_kwargs:
         given.add("train_freq")  # else there would be so many after each of its steps

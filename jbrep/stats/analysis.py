@@ -176,7 +176,6 @@ def _analyse_group(
 
 
 def _scores(groups: Sequence[GroupAnalysis]) -> dict[str, dict[str, dict[str, Array]]]:
-    """What each run scores, by algorithm, task and representation, where that is known."""
     scores: dict[str, dict[str, dict[str, Array]]] = {}
     for group in groups:
         if not math.isnan(group.ends.top):

@@ -133,7 +133,6 @@ def _shrunk(curves: Curves, log_ratio: float) -> tuple[Array, Array]:
 
 
 def _excess(curves: Curves, log_ratio: float) -> float:
-    """How much more x, divided by a ratio, spreads than y, as a logarithm."""
     x, y = _shrunk(curves, log_ratio)
     how = curves.weights, curves.resolution
     return float(log_spread(x.T, *how) - log_spread(y.T, *how))
@@ -175,15 +174,6 @@ def _last_kept(value: float, direction: int, is_rejected: Callable[[float], bool
     return kept
 
 
-def spread_ratio(pair: Pair, level: float, seed: int, permutations: int = TO_SHOW) -> Interval:
-    """The spread of training curves of x over that of y."""
-    return ratio_of_spreads(_curves(pair), level, seed, permutations)
-
-
-def _spread_p(pair: Pair, boundary: float, seed: int) -> float:
-    return spread_p(_curves(pair), seed)
-
-
 def _curves(pair: Pair) -> Curves:
     return Curves(pair.x.curves, pair.y.curves, pair.weights, pair.resolution)
 
@@ -215,9 +205,9 @@ LESS_VARIABLE = Claim(
     name="less variable",
     side=-1,
     boundary=lambda pair, margin: 1.0,
-    estimate=spread_ratio,
-    tested=partial(spread_ratio, permutations=PERMUTATIONS),
-    p_value=_spread_p,
+    estimate=lambda pair, level, seed: ratio_of_spreads(_curves(pair), level, seed),
+    tested=lambda pair, level, seed: ratio_of_spreads(_curves(pair), level, seed, PERMUTATIONS),
+    p_value=lambda pair, boundary, seed: spread_p(_curves(pair), seed),
     is_ratio=True,
 )
 CLAIMS = {claim.name: claim for claim in (BETTER, NOT_WORSE, FASTER, LESS_VARIABLE)}

@@ -122,7 +122,6 @@ def _end(run: RunCurve, curve: Array) -> float:
 
 
 def _ends(runs: Sequence[RunCurve], curves: Array, grid: Array, on_all_starts: bool) -> Array:
-    """The final return of each run, (runs,), as in `Compared`; curves are on the grid."""
     if on_all_starts:
         return np.array([*map(_end, runs, curves)])
     failed = [run.failed_at is not None and run.failed_at <= grid[-1] for run in runs]

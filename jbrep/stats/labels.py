@@ -185,16 +185,14 @@ def _numbers(
     numbers["final_return_mad"] = percentile(
         lambda v: median_abs_deviation(v, axis=-1), final, seed=seed
     )
-    numbers["risk_across_runs"] = percentile(
-        lambda v: expected_shortfall(v, _TAIL), final, seed=seed
-    )
+    numbers["risk_across_runs"] = percentile(expected_shortfall, final, seed=seed)
     for name in STEPS_TO:
         numbers[name] = percentile(median, by_run[name], seed=seed)
         numbers[REACHED[name]] = _share_reached(by_run[name])
     return numbers
 
 
-def expected_shortfall(values: Array, tail: float) -> Array:
+def expected_shortfall(values: Array, tail: float = _TAIL) -> Array:
     """The mean of the lowest part of (..., n), also called CVaR.
 
     A value on the edge of the tail counts in part (Rockafellar and Uryasev 2002,

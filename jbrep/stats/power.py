@@ -72,7 +72,6 @@ def _power(claim: str, margin: float, units: int, level: float) -> tuple[float, 
 
 
 def _power_of_spread(ratio: float, units: int, level: float) -> float:
-    """How often the permutation test finds curves closer together by a ratio."""
     random = np.random.default_rng(0)
     count = max(_LEAST_PERMUTATIONS, min(PERMUTATIONS, int(5 / level)))
     found = 0

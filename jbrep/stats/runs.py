@@ -168,7 +168,6 @@ def in_order(names: Iterable[str], baseline: str) -> list[str]:
 
 
 def _check_alike(runs: list[RunCurve], name: str) -> None:
-    """Make sure that the runs of a task and algorithm can be compared."""
     if runs[0].failure_return is None:
         raise InputError(f"{name}: every run failed before its first evaluation: see why they did")
     if len(environments := sorted({run.environment for run in runs})) > 1:

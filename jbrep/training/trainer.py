@@ -130,7 +130,6 @@ class Trainer:
 
     @property
     def _state(self) -> dict[str, Tensor]:
-        """Everything that an epoch changes, by name; the tensors themselves."""
         named = {f"network.{name}": p for name, p in self.objective.state_dict().items()}
         named |= {f"best.{name}": p for name, p in self.best.items()}
         for name, parameter in self.objective.named_parameters():
