@@ -237,20 +237,6 @@ def test_arguments_are_settings(sledges, tmp_path):
     assert (Dataset(tmp_path / "windy")["reward"][:10] != Dataset(sledges)["reward"][:10]).any()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"task": SLEDGE.replace(seed_bits=31), "seed": 2047}, "seeds of 31 bits: the data set's"),
-        ({"task": SLEDGE.replace(seed_bits=31), "steps": (40 << 20) + 1}, "1,048,576 episodes"),
-        ({"policy": {"kind": "heuristic"}}, f"{ID} has no hand-written policy"),
-    ],
-)
-def test_mistakes_leave_nothing_behind(change, message, tmp_path):
-    with pytest.raises(InputError, match=message):
-        collect(some(**change), tmp_path / "data")
-    assert not list(tmp_path.iterdir())
-
-
 def test_reading_makes_no_environment(tmp_path, monkeypatch):
     """None can be made, found or described then, as where its package isn't installed."""
     folder = tmp_path / "hopper"

@@ -1,6 +1,5 @@
 """Policies as functions of observations: they act as the runs that they were taken from."""
 
-import re
 from itertools import cycle
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pytest
 import torch
 
 import jbrep
-from jbrep.encoders import find
 from jbrep.envs.description import describe
 from jbrep.envs.lanes import Lanes
 from jbrep.errors import InputError

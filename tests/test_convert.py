@@ -197,15 +197,6 @@ def test_a_module_that_is_no_encoder_is_refused(forward, message):
     assert "\n" not in str(refused.value)
 
 
-def test_what_is_no_module_or_has_a_bad_name_or_decoder_is_refused():
-    with pytest.raises(InputError, match="function isn't a torch module"):
-        Encoder.from_torch(lambda x: x, TASK)
-    with pytest.raises(InputError, match="name is 'My net'"):
-        Encoder.from_torch(nn.Linear(16, 3), TASK, name="My net")
-    with pytest.raises(InputError, match="the last layer has 15 units, expected 16"):
-        Encoder.from_torch(nn.Linear(16, 3), TASK, decoder=nn.Linear(3, 15))
-
-
 def test_what_jbrep_exports_comes_back_with_its_decoder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     task = ("--task", "face_direction")

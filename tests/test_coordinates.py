@@ -9,8 +9,7 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 
-from jbrep.coordinates import INGREDIENTS, Coordinates, make_coordinates
-from jbrep.coordinates.coordinates import Part
+from jbrep.coordinates import INGREDIENTS, make_coordinates
 from jbrep.coordinates.formulas import FORMULAS
 from jbrep.coordinates.invariance import check_invariant
 from jbrep.coordinates.placing import continuous, nearest, placed
@@ -21,7 +20,6 @@ from jbrep.envs.view import with_view
 from jbrep.errors import InputError, Notice
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.records.record import from_plain, to_plain
 
 TASK = TASKS["move_to_pose"].plain
 ANGLES = ("motor_angle", "angle_to_target")
@@ -444,17 +442,3 @@ def test_an_angle_is_given_back_in_its_range():
     coordinates = make_coordinates(task, "angles")
     rows = np.insert(states(TASK, 3), 0, (3.0, 3.2, 4.5), axis=1)
     np.testing.assert_allclose(coordinates.inverse(coordinates.forward(rows))[:, 0], rows[:, 0])
-
-
-def test_a_strangers_coordinates_are_checked():
-    parts = make_coordinates(TASK, "symmetry").parts
-    plain = to_plain(parts)
-    assert from_plain(plain, tuple[Part, ...]) == parts
-    for spoiled, said in (
-        ([[*plain[0][:1], "exec", *plain[0][2:]]], "'exec': it must be one of attitude, body"),
-        ([["a", "circle", ["x", "y"], True, 0.0]], "a, circle, takes 1 numbers, but is given 2"),
-        ([["a", "polar", ["x", "y"], True, 0.0]], "the soft length of a is 0"),
-        ([["../a", "same", ["x"], True, 0.0]], "is '../a'"),
-    ):
-        with pytest.raises(InputError, match=said):
-            Coordinates(TASK, from_plain(spoiled, tuple[Part, ...]))

@@ -134,20 +134,6 @@ def test_a_checkpoint_resumes_to_the_same_weights(architecture, tmp_path):
     assert all(torch.equal(whole.best[name], second.best[name]) for name in whole.best)
 
 
-def test_a_checkpoint_of_something_else_is_refused(tmp_path):
-    it = trained()
-    it.save({"seed": 0, "noise": 0.1}, tmp_path / "at")
-    with pytest.raises(
-        InputError, match=r"belongs to another configuration: noise 0\.1 \(now: 0\.2\); choose"
-    ):
-        trainer().restore({"seed": 0, "noise": 0.2}, tmp_path / "at")
-    whole = (tmp_path / "at").read_bytes()
-    for content in (b"", whole[:50], whole[:-1], b"\x80" + whole[1:]):
-        (tmp_path / "at").write_bytes(content)
-        with pytest.raises(InputError, match="is not a jbrep checkpoint"):
-            trainer().restore({"seed": 0, "noise": 0.1}, tmp_path / "at")
-
-
 @pytest.mark.parametrize(
     ("settings", "named"),
     [

@@ -158,14 +158,6 @@ def test_files_that_can_t_be_read_are_named(copied):
         dataset["reward"][0]
 
 
-def test_other_files_are_left_alone(copied):
-    (copied / "notes.txt").write_text("collected on a Tuesday")
-    (copied / "manifest.json.partial").write_text("{")
-    shutil.copy(copied / "shard-00000.h5", copied / "copy.h5")
-    read_all(copied)
-    assert not list(find_problems(copied))
-
-
 def test_shards_without_a_manifest_are_no_data_set(copied, collected):
     (copied / MANIFEST).unlink()
     for use in (Dataset, lambda folder: list(find_problems(folder))):

@@ -205,14 +205,6 @@ def test_the_card_tells_what_is_there(dataset, collected):
     assert dataset.fingerprint in text
 
 
-@pytest.mark.parametrize("width", [60, 200])
-def test_the_card_fits_the_terminal(width, dataset):
-    text = dataset.card(width).replace(str(dataset.folder), "face").splitlines()
-    facts = [line for line in text if dataset.fingerprint not in line]
-    assert max(map(len, facts)) <= width
-    assert len([line for line in text if line.startswith("feature ")]) == (1 if width == 200 else 2)
-
-
 def test_a_data_set_as_json(dataset):
     about = json.loads(jbrep("data", "info", dataset.folder, "--json").stdout)
     assert (about["task"], about["rows"], about["episodes"]) == ("face_direction", 5000, 5)

@@ -3,9 +3,7 @@
 from unittest import mock
 
 import numpy as np
-import pytest
 from dm_control import suite
-from dm_control.rl import control
 
 from jbrep import jitterbug
 from jbrep.jitterbug.simulation import Simulation
@@ -113,28 +111,6 @@ def test_observations_share_no_memory(task):
     arrays = [*one.values(), *other.values()]
     for i, array in enumerate(arrays):
         assert not any(np.may_share_memory(array, b) for b in arrays[i + 1 :])
-
-
-def test_environment_kwargs_reach_the_environment(task):
-    environment = load(task, environment_kwargs={"flat_observation": True})
-    assert set(environment.observation_spec()) == {control.FLAT_OBSERVATION_KEY}
-    flat = environment.reset().observation[control.FLAT_OBSERVATION_KEY]
-    np.testing.assert_array_equal(flat, TASKS[task].observe(environment.physics.readings())[0])
-
-
-def test_reward_is_shown_by_colour(task):
-    environment = jitterbug.load(task, visualize_reward=True)
-    colours = environment.physics.named.model.mat_rgba
-    for reward, shown in ((-3, 0), (0.5, 0.5), (2, 1), (0.25, 0.25)):
-        with mock.patch.object(environment.task, "get_reward", return_value=reward) as get_reward:
-            environment.reset()
-            get_reward.assert_called_with(environment.physics)
-        for name in ("self", "effector", "target"):
-            blend = shown**4
-            default, highlight = colours[f"{name}_default"], colours[f"{name}_highlight"]
-            expected = blend * highlight + (1 - blend) * default
-            np.testing.assert_allclose(colours[name], expected, atol=1e-6)
-            assert not np.allclose(default, highlight)
 
 
 def test_a_generator_may_be_passed(task):

@@ -19,7 +19,6 @@ from jbrep.jitterbug.tasks import TASKS
 
 IDS = [environment_id(task) for task in TASKS]
 FACE = environment_id("face_direction")
-FIRST = [("jbrep", "train"), ("jbrep.envs", "Lanes"), ("jbrep.jitterbug", "JitterbugEnv")]
 
 
 def test_the_ids():
@@ -36,20 +35,6 @@ def test_importing_jbrep_after_gymnasium_registers_them():
     code = f"import gymnasium, jbrep; print(gymnasium.spec('{FACE}').max_episode_steps)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "1000\n"
-
-
-def test_whatever_is_imported_first():
-    """Each in a process of its own, in which neither jbrep nor Gymnasium has been imported."""
-    code = f"""
-import mujoco, os, sys, torch
-assert not [name for name in sys.modules if name.startswith(("jbrep.", "gymnasium"))]
-for package, name in {FIRST}:
-    if os.fork() == 0:
-        exec(f"from {{package}} import {{name}}; import gymnasium; gymnasium.spec('{FACE}')")
-        os._exit(0)
-    assert os.wait()[1] == 0, (package, name)
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.filterwarnings("ignore:.*-?infinity. This is probably too")  # no state is bounded

@@ -1,6 +1,5 @@
 """Diagnostics: against closed forms, other libraries, and sums by hand."""
 
-import tracemalloc
 from pathlib import Path
 
 import mujoco
@@ -108,18 +107,6 @@ def test_sums_of_parts_are_those_of_the_whole(held_out):
     whole = held_out.sums(rows, values, values[:, :3])
     for ours, theirs in zip(held_out.sums_of_parts(rows, parts), whole, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12)
-
-
-def test_all_held_out_rows_are_judged_in_little_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.dataset.columns._CHUNK_NUMBERS", 1 << 16)
-    data = wide([500] * 40, features=100, folder=tmp_path)
-    data.train, data.test = data.test, data.train
-    it, coder = HeldOut(data), make(data, principal_code(data, 3))
-    tracemalloc.start()
-    reconstruction(coder, it)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < len(data.test) * data.task.size * 4
 
 
 def test_errors_are_those_of_encode_and_decode(held_out, coder):

@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import onnx
 import onnxruntime
 import pytest
 import torch
@@ -88,24 +87,6 @@ def test_the_policy_that_ships_is_exported_by_its_name(tmp_path):
     model_played, shipped = jbrep(*checking.split(), "--episodes", 1).output.splitlines()[:2]
     assert model_played.startswith(f"face_direction, {model}: 9")
     assert shipped.startswith("trained: 9")
-
-
-def test_mistakes_are_a_line(run, tmp_path):
-    model, bad, other = run.with_suffix(".onnx"), tmp_path / "bad.onnx", tmp_path / "other.onnx"
-    exporting, checking = ("policy", "export", run, "--out"), ("policy", "check")
-    assert f"{model} exists already: choose another name" in mistake(*exporting, model)
-    said = mistake(*exporting, tmp_path / "x", "--format", "tflite")
-    assert "unknown format 'tflite': choose one of onnx, torch" in said
-    said = mistake(*exporting, tmp_path / "x", "--task", "face_direction")
-    assert "which say their own: leave out --task" in said
-    bad.write_bytes(b"no model")
-    assert "isn't an ONNX model that can be run: " in mistake(*checking, bad)
-    said = mistake(*checking, model, "--task", "face_direction")
-    assert f"{model} was made for Pendulum-v1, not for face_direction" in said
-    changed = onnx.load(model)
-    del changed.metadata_props[:]
-    onnx.save(changed, other)
-    assert f"{other} isn't a policy that jbrep policy export wrote" in mistake(*checking, other)
 
 
 def test_an_encoder_that_is_code_cannot_be_exported(tmp_path):

@@ -15,7 +15,6 @@ from jbrep.reporting import report
 from jbrep.reporting.findings import Findings
 from jbrep.reporting.tables import read_tables
 from jbrep.reporting.views import returns_tables
-from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, INFOS, Info, read_infos, read_run
 from jbrep.studies.config import Study
 from jbrep.studies.plan import Plan
@@ -106,14 +105,6 @@ def test_evaluate_policy_says_them(run):
     )
     expected = [dict(zip(NAMES, told(episode), strict=True)) for episode in range(5)]
     assert json.loads(jbrep(*command, "--json").stdout)["infos"] == expected
-
-
-def test_others_have_no_such_table(tmp_path):
-    sledge = Run.of("Sledges/Sledge-v0", "a2c", steps=40, evaluation_episodes=1, final_episodes=1)
-    result = train(sledge, tmp_path)
-    assert read_infos(tmp_path) == []
-    assert not (tmp_path / INFOS).exists()
-    assert INFOS not in result.tables
 
 
 @pytest.fixture(scope="module")

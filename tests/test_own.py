@@ -11,7 +11,6 @@ import pytest
 import torch
 from command import jbrep, mistake, refused
 from gymnasium.utils.env_checker import check_env
-from rerun.chunk import RrdReader
 from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -27,7 +26,6 @@ from jbrep.envs import describe
 from jbrep.envs.names import import_code
 from jbrep.errors import InputError
 from jbrep.evaluation import diagnose
-from jbrep.inspection import inspect
 from jbrep.jitterbug import JitterbugEnv
 from jbrep.reporting.evaluation import evaluation_text
 from jbrep.rl import Run, Session, train
@@ -120,11 +118,6 @@ def test_a_transformer_of_scikit_learn_is_an_encoder():
     assert of_frame.encode(rows).shape == (200, 2)
     with pytest.raises(InputError, match=r"PCA failed: NotFittedError: .*"):
         as_encoder(PCA(2), describe("Pendulum-v1"))
-
-
-def read(path):
-    """The entities of a recording."""
-    return {chunk.entity_path for chunk in RrdReader(path).stream()}
 
 
 @pytest.mark.parametrize(
@@ -268,24 +261,6 @@ def test_a_run_on_code_is_played_once_its_module_may_run(trained, monkeypatch):
     assert "on Half: median" in jbrep(*played, "--import", "test_own").output
     monkeypatch.setattr(Half, "encode", lambda self, rows: rows[:, :2] / 3)
     assert "is not the encoder that the run in" in refused(load_run, run)
-
-
-def test_recordings_with_own_encoders(trained, tmp_path):
-    out = tmp_path / "it.rrd"
-    assert jbrep("inspect", trained / "code", "--out", out).exit_code == 0
-    shown = read(out)
-    assert {"/latent/units", "/latent/path", "/observation/obs"} <= shown
-    assert not {path for path in shown if path.startswith(("/reconstruction", "/error"))}
-    swept = mistake("inspect", trained / "code", "--traverse", "--out", tmp_path / "no.rrd")
-    assert "Half has no decoder: --traverse" in swept
-    assert {"/error/total", "/reconstruction/obs"} <= read(
-        inspect(str(trained / "object"), encoder=Whole(), out=out)
-    )
-    inspect(encoder=Whole(), task=TASK, traverse=True, out=out)
-    assert "/traverse/unit_2/decoded" in read(out)
-    told = []
-    inspect("uniform", task=TASK, encoder="test_own:Half", out=out, tell=told.append)
-    assert told == ["encoder: test_own:Half, code"]
 
 
 def test_a_run_on_an_object_needs_it_again(trained):

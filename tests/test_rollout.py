@@ -174,21 +174,6 @@ def test_what_can_t_be_simulated_here_is_shown_as_stored(hopper):
     assert_stored(rollout, hopper, 0)
 
 
-@pytest.mark.parametrize(
-    ("source", "episode", "task", "message"),
-    [
-        ("nowhere", 0, None, "nowhere is no data set, no run with a policy or checkpoint, and no"),
-        ("heuristic", 0, None, "policy heuristic needs a --task"),
-        ("heuristic", 0, "Pendulum-v1", "Pendulum-v1 has no hand-written policy"),
-        ("data/sample/face_direction", 4, None, "has no episode 4: it has 4, numbered from 0"),
-        ("data/sample/face_direction", 0, "move_to_pose", "is of face_direction, not of move_to"),
-    ],
-)
-def test_mistakes(source, episode, task, message):
-    with pytest.raises(InputError, match=message):
-        find_episode(source, episode, task and describe(task))
-
-
 def test_a_data_set_has_its_own_time_limit():
     with pytest.raises(InputError, match="has its own arguments, time limit and features"):
         find_episode("data/sample/face_direction", 0, describe("face_direction", None, 20))

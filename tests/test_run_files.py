@@ -4,7 +4,6 @@ import functools
 import hashlib
 import json
 import operator
-import pickle
 import shutil
 from pathlib import Path
 
@@ -33,7 +32,6 @@ from jbrep.rl.files import (
 )
 from jbrep.rl.history import Scalars
 from jbrep.rl.policy import load_run, load_untrained
-from jbrep.rl.policy_file import read
 
 TASK = describe("face_direction", max_episode_steps=100)
 SETTINGS = Run.of(
@@ -132,14 +130,6 @@ def test_a_field_of_a_run_that_cant_be_is_named(path, value, run):
     assert path[-1] in told
 
 
-@pytest.mark.parametrize("content", [b"[]", b'{"format": "jbrep run", "format_version": 7}'])
-def test_a_run_file_of_anything_else(content, run):
-    (run / RUN).write_bytes(content)
-    assert RUN in refused(read_run, run)
-    for command in (("evaluate-policy", run), ("report", run), ("inspect", run)):
-        mistake(*command)
-
-
 def test_weights_are_those_of_the_run(run):
     path, weights = run / POLICY, weights_of(run)
     container.write(path, weights | {"more": np.ones(1)}, container.read(path, "policy")[1])
@@ -176,36 +166,6 @@ def test_a_policy_that_isn_t_the_run_s(make, run):
     """Its hashes are right: a stranger can work them out."""
     forge_policy(run, make(weights_of(run)))
     assert POLICY in refused(load_run, run)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [lambda raw: raw[:-1] + bytes([raw[-1] ^ 1]), lambda raw: raw[:-40], pickle.dumps],
-    ids=["a bit", "cut short", "pickled"],
-)
-def test_a_policy_s_file_that_is_none(make, run):
-    content = make((run / POLICY).read_bytes())
-    (run / POLICY).write_bytes(content)
-    change(run, policy_sha256=hashlib.sha256(content).hexdigest())
-    assert POLICY in refused(load_run, run)
-
-
-@pytest.mark.parametrize(("name", "value"), [("settings", {}), ("step", -1), ("finished", "x")])
-def test_a_field_of_a_policy_s_header_that_cant_be_is_named(name, value, run):
-    tensors, header = container.read(run / POLICY, "policy")
-    container.write(run / POLICY, tensors, {**header, name: value})
-    assert name in refused(read, run / POLICY)
-
-
-def test_weights_too_large_to_act_with_are_refused(run):
-    shorten(run)
-    signs = {
-        n: np.sign(t - np.float32(0.01)) if n[0] == "p" else t for n, t in weights_of(run).items()
-    }
-    forge_policy(
-        run, {n: np.float32(1e38) * sign if n[0] == "p" else sign for n, sign in signs.items()}
-    )
-    assert "the policy's actions are not finite" in mistake("evaluate-policy", run, "--episodes", 1)
 
 
 def test_a_run_under_way_plays_its_checkpoint(under_way, trained):

@@ -89,15 +89,6 @@ def test_the_middle_of_an_episode_is_restored_to_the_same_bits(task):
                 np.testing.assert_array_equal(ours, theirs)
 
 
-def test_an_environment_that_is_not_reproducible_is_not_restored():
-    task = describe(cart.ID, {"drifts": True})
-    assert not task.reproducible
-    one, other = JitterbugVecEnv(task, 1), JitterbugVecEnv(task, 1)
-    one.reset()
-    with pytest.raises(InputError, match=r"Test/Cart-v0 is not reproducible here"):
-        other.restore(one.state)
-
-
 @pytest.mark.parametrize(("lanes", "threads"), [(3, 1), (8, None)])
 def test_lane_i_has_the_episodes_of_seed_plus_i(lanes, threads):
     def tape(environment, lane, drive):

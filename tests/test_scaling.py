@@ -1,7 +1,5 @@
 """Scalings, coordinates, limits and features around the layers, in every library."""
 
-import json
-
 import numpy as np
 import onnxruntime
 import pytest
@@ -16,7 +14,6 @@ from jbrep.encoders.header import EncoderHeader
 from jbrep.encoders.onnx import export
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.records import container
 
 RANDOM = np.random.default_rng(0)
 TASK = describe("face_direction")
@@ -165,23 +162,3 @@ def test_an_observation_survives_sine_and_cosine_and_what_is_kept_survives_the_l
     assert lost[:, 0].max() > 0.1
     many = rows * np.float32(1e4)
     assert np.abs(it.scaler.scale(many)).max() == np.float32(1.5)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"coordinates": [["a", "circle", ["wing"], True, 0.0]]}, "a takes wing, which face_dir"),
-        ({"coordinates": []}, r"tensor low has shape \(18,\), expected \(16,\)"),
-        ({"coordinates": [["a", "same", ["velocity_x"], True, 0.0]]}, "tensor low has shape"),
-        ({"clip": 0.5}, "clip is 0.5"),
-        ({"keep": ["wing"]}, "face_direction has no feature 'wing': it has"),
-        ({"keep": ["velocity_x"] * 2}, "what it keeps must be different features"),
-    ],
-)
-def test_a_header_that_contradicts_its_tensors_is_one_line(changes, message, tmp_path):
-    save(encoder(), tmp_path / "it")
-    tensors, header = container.read(tmp_path / "it", "encoder")
-    container.write(tmp_path / "it", tensors, {**header, **json.loads(json.dumps(changes))})
-    with pytest.raises(InputError, match=message) as refused:
-        load(tmp_path / "it")
-    assert "\n" not in str(refused.value)

@@ -170,23 +170,6 @@ def test_blocks_give_every_window_once_and_only_so_many_where_rows_are_wide(move
     assert 0 < sum(some) <= len(given) / 3
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"kind": "slow", "lags": 500}, "500 steps"),
-        ({"kind": "slow", "latent": 5}, "latent size is 5"),
-        (
-            {"kind": "linear-forward", "latent": 2, "changes": 0, "values": 0, "horizons": 5},
-            "rank 1",
-        ),
-    ],
-)
-def test_a_mistake_is_one_line(moved, settings, said):
-    with pytest.raises(InputError, match=said) as caught:
-        made(moved, **settings)
-    assert "\n" not in str(caught.value)
-
-
 def test_features_that_depend_on_others_are_named(tmp_path):
     extra = system(tmp_path / "sum", extra=lambda rows: rows[:, :1] - 2 * rows[:, 2:3])
     names = extra.task.feature_names

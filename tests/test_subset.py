@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from jbrep.errors import InputError
 from jbrep.methods.fit import Fitter
 
 
@@ -40,21 +39,6 @@ def test_a_subset_of_an_angle_is_its_sine_and_cosine(fit, observations):
     )
     angle = observations[:, 13]
     np.testing.assert_allclose(code, np.column_stack((np.cos(angle), np.sin(angle))), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("kind", "settings", "said"),
-    [
-        ("subset", {}, "features"),
-        ("subset", {"features": "position_x,speed_*"}, r"speed_\*"),
-        ("subset", {"features": "position_*", "latent": 3}, "latent"),
-        ("noise", {"latent": 18, "on": "angles"}, "at least 19"),
-    ],
-)
-def test_a_mistake_is_one_line(data, kind, settings, said, tmp_path):
-    with pytest.raises(InputError, match=said) as caught:
-        Fitter(data, tmp_path).fit(kind, **settings)
-    assert "\n" not in str(caught.value)
 
 
 def test_noise_is_beside_all_features_and_unrelated_to_them_and_to_itself(data, fit, observations):

@@ -1,6 +1,5 @@
 """Collecting with the policies of runs: kept with the data, acting alike in whatever order."""
 
-import json
 import pickle
 import shutil
 
@@ -8,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from command import jbrep
-from small import contents, forge, settings
+from small import contents, settings
 
 from jbrep.collecting import collect
 from jbrep.collecting.backends import make_episodes
@@ -24,7 +23,7 @@ from jbrep.inspection.subject import _find
 from jbrep.play.sources import find_player, find_policy
 from jbrep.records import container
 from jbrep.rl import Run, Session, train
-from jbrep.rl.files import CHECKPOINT, RUN
+from jbrep.rl.files import CHECKPOINT
 from jbrep.rl.policy import load_run, pack
 
 import_modules(["environments"])
@@ -167,21 +166,3 @@ def test_a_policy_s_file_works_wherever_a_policy_is_named(runs, tmp_path):
     assert dataset.manifest.settings.policy["run"] == "mine"
     rollout, encoder = _find(str(path), 1, None, None)
     assert (rollout.name, encoder.name) == (str(path), "dae-8")
-
-
-def test_what_can_t_be_collected_with_is_said_in_one_line(runs, data, tmp_path):
-    with pytest.raises(InputError, match="is of face_direction, not of move_to_pose"):
-        gather(runs / "jb", tmp_path / "other", task="move_to_pose")
-    with pytest.raises(
-        InputError, match="the folder of a run with a policy or checkpoint, or a mixture"
-    ):
-        gather("nothing/here", tmp_path / "other")
-    with pytest.raises(InputError, match="other settings: task"):
-        gather(runs / "sledge", data, task=SLEDGE, store_state=False)
-    record = json.loads((runs / "jb" / RUN).read_text())
-    code = shutil.copytree(runs / "jb", tmp_path / "code")
-    (code / "encoder.safetensors").unlink()
-    forge(code / RUN, record)
-    with pytest.raises(InputError, match="its encoder is code, which can't be kept with the data"):
-        gather(code, tmp_path / "other")
-    assert not (tmp_path / "other").exists()

@@ -9,12 +9,10 @@ from test_controller import controller_of, difference_over_an_episode, randomise
 
 from jbrep.collecting import collect
 from jbrep.collecting.derive import derive_view
-from jbrep.collecting.policies import Heuristic
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.envs import Lanes, describe
 from jbrep.envs.names import import_modules
 from jbrep.envs.view import with_view
-from jbrep.errors import InputError
 from jbrep.rl.controller import export
 
 import_modules(["environments"])
@@ -158,22 +156,6 @@ def test_a_robot_goes_on_after_sensors_that_are_not_believed(on_robot):
     assert robot.act(5, shown[5]) is late
     assert robot.act(0, unknown) is None  # another episode, which knows nothing of this one
     np.testing.assert_array_equal(robot.act(1, shown[0]), first)
-
-
-def test_what_a_view_refuses(task, seen):
-    for hidden, history, said in (
-        (["speed"], 1, "move_in_direction has no feature 'speed': it has position_x, "),
-        (["*"], 1, "all features are hidden: leave some to see"),
-        ((), 5000, "history"),
-    ):
-        with pytest.raises(InputError, match=said):
-            with_view(task, hidden, history)
-    with pytest.raises(InputError, match="already"):
-        with_view(seen, history=2)
-    with pytest.raises(InputError, match="its features must be those that its view shows"):
-        seen.replace(features=seen.features[1:])
-    with pytest.raises(InputError, match="has no hand-written policy"):
-        Heuristic().begin(seen, [0])
 
 
 def test_commands_take_what_is_seen(tmp_path, monkeypatch):
