@@ -131,7 +131,8 @@ class Controller:
         """The action (k,) at an observation (d,) in the units of the task's features, less offsets.
 
         Several robots may be given at once, (n, d), for (n, k), the same until `reset`. A policy
-        that was trained with a history keeps it: give what the robot shows now.
+        that was trained with a history keeps it: give what the robot shows now. What is refused
+        changes nothing: the next call goes on from the one before.
         """
         try:
             rows = _numbers(observation)
