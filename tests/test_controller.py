@@ -1,5 +1,6 @@
 """Policies as functions of observations: they act as the runs that they were taken from."""
 
+import re
 from itertools import cycle
 from pathlib import Path
 
@@ -133,7 +134,7 @@ def test_what_is_refused_changes_nothing(history):
     """A policy that sees less takes no more; steps that hold an action are checked, too."""
     seen = describe("Pendulum-v1", hidden=["obs_0"], history=history)
     run = Run.of(seen, "sac", preset="paper", overrides={"action_repeat": 2})
-    encoder = find("full", seen)
+    encoder = run.find_encoder()
     trained = build(run.settings(encoder), encoder, Path("here"))
     controller, other = controller_of(trained), controller_of(trained)
     takes = "the policy takes 2 numbers, of obs_1, obs_2; or a row of them for each robot"
@@ -176,8 +177,3 @@ def test_what_it_cannot_act_on_is_refused():
     ):
         controller(np.full(TASK.size, 1e38))
     assert controller(np.zeros(TASK.size)).shape == (TASK.action_size,)  # there is none to hold
-    run = Run.of(TASK, "sac", overrides={"use_sde": True})
-    encoder = find("full", TASK)
-    trained = build(run.settings(encoder), encoder, Path("here"))
-    with pytest.raises(InputError, match="use_sde"):
-        controller_of(trained)

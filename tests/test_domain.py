@@ -3,6 +3,7 @@
 from unittest import mock
 
 import numpy as np
+import pytest
 from dm_control import suite
 
 from jbrep import jitterbug
