@@ -115,6 +115,8 @@ def _required(extra: str) -> Iterator[Requirement]:
 
 
 def extra_with(module: str) -> str | None:
-    """The first extra that brings a module, for what to install; None if no extra does."""
+    """The smallest extra that brings a module, for what to install; None if no extra does."""
     name = _DISTRIBUTIONS.get(module, module.replace("_", "-"))
-    return next((e for e in extras() if name in (r.name for r in _required(e))), None)
+    bringing = {extra: [r.name for r in _required(extra)] for extra in extras()}
+    fitting = {extra: names for extra, names in bringing.items() if name in names}
+    return min(fitting, key=lambda extra: len(fitting[extra]), default=None)

@@ -44,7 +44,11 @@ PYTHON = found(r"^```python\n(.*?)^```")
     "block", [block for block in PYTHON if block not in (ENVIRONMENT, NUMBERS)]
 )
 def test_the_python_runs(block, monkeypatch, tmp_path):
-    for name in ("data", "jbrep"):  # what the blocks read; what they write stays out of here
+    for name in (
+        "data",
+        "jbrep",
+        "results",
+    ):  # what the blocks read; what they write stays out of here
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     exec(compile(block, "block", "exec"), {})

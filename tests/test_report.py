@@ -285,7 +285,7 @@ def test_a_report_compares_with_the_study_s_baseline(whole, tmp_path):
 def test_an_unfinished_study_says_what_is_missing(tmp_path):
     plan = make_study(tmp_path / "half", left=5)
     (plan.folder_of(plan.cells[-1])).mkdir(parents=True)
-    (plan.folder_of(plan.cells[-1]) / "progress").write_text("700 12")
+    (plan.folder_of(plan.cells[-1]) / "progress").write_text("700")
     write_tables(plan.folder)
     path, page, *_ = write_report(found_in(plan.folder), plan.folder)
     found = json.loads(path.read_text())

@@ -68,8 +68,9 @@ def parse_json(raw: bytes, path: Path, what: str) -> dict[str, Any]:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """The contents of a TOML file."""
+    raw = read_file(path)
     try:
-        return tomllib.loads(read_file(path).decode())
+        return tomllib.loads(raw.decode())
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid TOML: {error}") from None
 
