@@ -7,9 +7,9 @@ from wide import wide
 
 from jbrep.errors import DamageError, InputError
 from jbrep.evaluation import diagnose
+from jbrep.evaluation.diagnosis import SCALARS
 from jbrep.evaluation.evaluation import _REGISTERED, Scalar, Score, diagnostic
 from jbrep.evaluation.table import (
-    SCALARS,
     Diagnosed,
     by_label,
     diagnostics_text,
