@@ -23,7 +23,6 @@ COMMANDS = {
         *("--out", "out"),
     ),
     "evaluate-policy": ("evaluate-policy", "uniform", *TASK, "--episodes", "2", "--json"),
-    "render": ("render", "uniform", *TASK, "--out", "out.gif"),
     "inspect": ("inspect", "uniform", *TASK, "--out", "out.rrd"),
 }
 SECONDS = 60
