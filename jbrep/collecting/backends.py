@@ -48,14 +48,10 @@ def _can_be_sent(*parts: Any) -> bool:
 
 
 class _Ahead:
-    """The pieces of a data set that are made side by side: of a shard each, in order.
-
-    Attributes:
-        waiting: those that were begun and aren't given yet, or what stands for them.
-    """
+    """The pieces of a data set that are made side by side: of a shard each, in order."""
 
     def __init__(self, growth: Growth):
-        self.waiting = deque[Any]()
+        self.waiting = deque[Any]()  # those that were begun, or what stands for them
         self._growth, self._begin = growth, growth.episodes
         self._each = growth.manifest.settings.shard_episodes
 
@@ -103,14 +99,8 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
 def make_episodes(
     known: tuple[tuple[str, ...], EnvSpec], simulator: Simulator, episodes: range
 ) -> Made:
-    """Make some episodes, in a process of its own.
-
-    Args:
-        known: modules to import, and what the environment is, if none of them registers it.
-        simulator: makes them.
-        episodes: of one shard.
-    """
-    modules, spec = known
+    """Make some episodes of one shard, in a process of its own."""
+    modules, spec = known  # to import, and what the environment is, if none of them registers it
     made: Made = []
     try:
         import_modules(modules)

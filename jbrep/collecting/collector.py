@@ -81,8 +81,6 @@ def write_shards(
     """Write the missing shards, until there are as many rows as the settings ask for.
 
     Args:
-        settings: of the data set.
-        folder: of the data set.
         produce: makes the episodes.
         files: that the data set needs besides, by name.
         check: called with the manifest of what is wanted, where episodes are there already: whether

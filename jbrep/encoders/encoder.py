@@ -81,7 +81,6 @@ class Encoder(BaseEncoder):
 
     Attributes:
         header: that of its file, with what follows from the other arguments.
-        scaler, encoder, decoder: as given.
         kept: places of the scaled numbers that pass around the layers.
         arrays: what it computes with, in NumPy.
     """

@@ -38,14 +38,8 @@ class AutoresetLanes:
     itself.
 
     Args:
-        task: whose environment is made.
-        num_lanes: n.
-        num_threads: threads to step a batch on.
         repeat: steps for which each action is held; fewer where an episode ends before.
         retries: of failures, each of which ends an episode, truncated, before the step that failed.
-
-    Attributes:
-        lanes: the episodes under way.
     """
 
     def __init__(

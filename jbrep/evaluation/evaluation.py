@@ -10,7 +10,6 @@ registered, so that a further diagnostic is a further function, such as
 """
 
 import json
-import re
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 
@@ -163,14 +162,8 @@ class Evaluation(Document, frozen=True, kw_only=True):
         return {name: each.sha256 for name, each in self.encoders.items() if each.sha256}
 
     def text(self) -> str:
-        """As JSON, with numbers of six digits and each list of numbers on one line."""
-        text = json.dumps(_rounded(self.as_json()), indent=self.indent)
-        parts = re.compile(r'"(?:[^"\\]|\\.)*"|\[[-+.,\deEnul\s]*\]')  # text stays as it is
-
-        def on_one_line(part: re.Match[str]) -> str:
-            return part[0] if part[0].startswith('"') else " ".join(part[0].split())
-
-        return parts.sub(on_one_line, text) + "\n"
+        """As JSON, with numbers of six digits."""
+        return json.dumps(_rounded(self.as_json()), indent=self.indent) + "\n"
 
 
 def _rounded(value: Any) -> Any:

@@ -38,12 +38,7 @@ def diagnostics_text(rows: Sequence[Diagnosed]) -> str:
 
 
 def read_diagnostics(path: Path, sha256: str | None = None) -> list[Diagnosed]:
-    """The rows of the table, with whatever numbers it has.
-
-    Args:
-        path: of its file.
-        sha256: of the file, if it is known.
-    """
+    """The rows of the table, with whatever numbers it has."""
     return [Diagnosed(*row) for row in read_csv(path, _KEY, sha256, further=_value)]
 
 

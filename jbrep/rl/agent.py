@@ -233,14 +233,8 @@ def deterministic_actor(
     """The policy's most likely actions, within their bounds despite rounding.
 
     They are not finite where its weights aren't. A policy whose own actions are in [-1, 1] has them
-    scaled to the task's bounds.
-
-    Args:
-        policy: which to play.
-        task: what is played.
-        preprocess: what the policy sees of observations (n, d) in single precision.
-        batch_size: how many go through the network at once, since it rounds differently in batches
-            of other sizes; all of them if not given.
+    scaled to the task's bounds. What it sees of observations (n, d) is preprocessed. A network
+    rounds differently in batches of other sizes; all rows are one if no size is given.
     """
     policy.set_training_mode(False)
     low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
@@ -289,10 +283,6 @@ def evaluate(agent: BaseAlgorithm, lanes: Lanes, encoder: BaseEncoder, episodes:
     """What comes of an agent's deterministic policy in the same episodes each time.
 
     What it normalises, it normalises by its statistics so far, which stay as they are.
-
-    Raises:
-        NonFiniteActionError: the policy's actions are not finite.
-        EnvironmentFailedError: the environment fails in the middle of an episode.
     """
     preprocess = preprocessor(encoder.encode, statistics_of(agent))
     act, repeat = deterministic_actor(agent.policy, lanes.task, preprocess), action_repeat(agent)

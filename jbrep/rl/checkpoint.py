@@ -183,10 +183,7 @@ def _obstacle(
 class Saver:
     """Writes a run's checkpoints, the last one alone.
 
-    Args:
-        folder: of the run.
-        settings, versions: of the run.
-        every: seconds between checkpoints; more where writing one takes over two seconds.
+    There are so many seconds between them, more where writing one takes over two seconds.
     """
 
     def __init__(

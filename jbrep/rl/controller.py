@@ -84,14 +84,10 @@ class Controller:
         controller = jbrep.load_policy("runs/a")
         action = controller(observation)
 
-    Args:
-        settings: of the run.
-        encoder: the run's.
-        weights: of the part of the policy that acts, by stable-baselines3's names.
-        statistics: by which the policy normalises what it sees, if it does.
+    It is made of the run's settings and encoder, and of the weights of the part that acts, by
+    stable-baselines3's names.
 
     Attributes:
-        settings: of the run.
         task: says what the observation's numbers and the action's are: names, units, ranges.
         encoder: what the network sees is its latent.
         acting: what is computed of that.
@@ -189,13 +185,7 @@ class Controller:
 
 
 def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[Layer, ...]:
-    """The layers of a policy from what it sees to its most likely action, not yet squashed.
-
-    Args:
-        settings: of the run.
-        inputs: numbers that it sees.
-        weights: of the part that acts, by stable-baselines3's names.
-    """
+    """The layers of a policy from what it sees to its most likely action, not yet squashed."""
     shape = settings.hyperparameters
     activation = str(shape.policy_kwargs.get("activation_fn")).replace("_", "-")
     choose(activation, ACTIVATIONS, "activation")

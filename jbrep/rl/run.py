@@ -70,11 +70,7 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
             return find(self.encoder, self.task)
 
     def settings(self, encoder: BaseEncoder) -> RunSettings:
-        """All settings that two equal runs share.
-
-        Args:
-            encoder: what `find_encoder` returns.
-        """
+        """All settings that two equal runs share, given what `find_encoder` returns."""
         is_kept_as_code = is_code(self.encoder) and not isinstance(encoder, Encoder)
         shared = to_plain(self.training_settings) | {
             "device": get_device(self.device).type,

@@ -103,20 +103,9 @@ def train(
 ) -> RunRecord:
     """Train an agent and write its folder, unless the run has ended already.
 
-    A run that was killed or stopped resumes from its checkpoint, to the same bits.
-
-    Args:
-        run: what to train.
-        folder: for this run alone.
-        session: what goes on around training.
-        encoder: what `run.find_encoder` returns, if it is known.
-
-    Returns:
-        The contents of run.json; where a run that went on with more steps failed, why: its files
-        are those of the steps before.
-
-    Raises:
-        StoppedError: the session's `stop` was true.
+    A run that was killed or stopped resumes from its checkpoint, to the same bits; a StoppedError
+    says that the session's `stop` was true. The encoder is what `run.find_encoder` returns.
+    Of a run that went on with more steps and failed, the files are those of the steps before.
     """
     encoder = encoder or run.find_encoder()
     if ended := standing_of(run, folder, encoder).ended:
@@ -280,8 +269,7 @@ class _Progress(BaseCallback):
     def _evaluate(self, observed: Any) -> None:
         """Evaluate, with one robot between episodes: the next one begins once more.
 
-        Args:
-            observed: its first observation as the agent is to see it, (1, l).
+        What was observed, (1, l), becomes its first observation as the agent is to see it.
         """
         self._play(self._settings.evaluation_episodes)
         if self._job.run.one_robot:

@@ -81,13 +81,10 @@ def tune(
         seeds: how many runs each trial has, with the run's seed and those that follow.
         folder: of this search alone.
         watch: called with each trial that has ended.
-        stop: asked before each rollout; once it is true, the run writes a checkpoint and stops.
+        stop: asked before each rollout; once it is true, the run stops with a StoppedError.
 
     Returns:
         The best trial.
-
-    Raises:
-        StoppedError: `stop` was true.
     """
     settings = run.settings(run.find_encoder())
     if not 1 <= seeds <= _MOST_SEEDS:

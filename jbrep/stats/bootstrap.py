@@ -39,11 +39,8 @@ def bootstrap(statistic: Callable[..., ArrayLike], *sums: Array) -> Interval:
     """A statistic of sums over all episodes with its interval, which is NaN for one episode.
 
     The resamples depend on the number of episodes alone, so statistics of the same episodes are
-    compared on the same resamples.
-
-    Args:
-        statistic: maps sums over episodes, (..., k) each, to values, (...).
-        sums: for each episode, (episodes, ...) each.
+    compared on the same resamples. A statistic maps sums over episodes, (..., k) each, to values,
+    (...); the sums are for each episode, (episodes, ...) each.
     """
     count = len(sums[0])
     weights = _weights(count)

@@ -77,12 +77,8 @@ def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) 
     """A statistic with its 95 % percentile interval, from a stratified bootstrap over whole runs.
 
     Resamples in which the statistic is undefined widen the interval at both ends. Of fewer runs
-    than FEWEST_RUNS in a sample there is no interval: it is NaN.
-
-    Args:
-        statistic: maps samples with runs on the last axis, (..., n) each, to values, (...).
-        samples: one for each group, (..., n) each; each group is resampled on its own.
-        seed: of the resamples.
+    than FEWEST_RUNS in a sample there is no interval: it is NaN. A statistic maps samples with runs
+    on the last axis, (..., n) each, to values, (...); each is resampled on its own.
     """
     if min(sample.shape[-1] for sample in samples) < FEWEST_RUNS:
         with np.errstate(divide="ignore", invalid="ignore"):
