@@ -22,7 +22,7 @@ from jbrep.inspection.blueprint import traversal_layout
 from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot, shapes
 from jbrep.inspection.scene import shades
-from jbrep.inspection.signals import panels, principal_components
+from jbrep.inspection.signals import principal_components
 from jbrep.inspection.subject import POINTS, SPACING, sweep
 from jbrep.play.sources import find_episode
 from jbrep.rl import Run
@@ -313,12 +313,6 @@ def test_a_robot_without_mujoco_shows_its_signals(short):
     assert scalars(found["/error/total"]).max() < 1e-6
     assert not any(path.startswith("/world") for path in found)
     assert f"- return: {rollout.episode_return:.1f}" in text(found["/provenance"])
-
-
-def test_panels_have_few_lines_of_about_equal_number():
-    found = panels({"a": slice(0, 12), "b": slice(12, 25), "c": slice(25, 26)})
-    parts = {"b_0-5": slice(12, 18), "b_6-12": slice(18, 25)}
-    assert found == {"a": slice(0, 12), **parts, "c": slice(25, 26)}
 
 
 SHAPES = """

@@ -18,7 +18,7 @@ from jbrep.envs.names import import_modules
 from jbrep.envs.physics import physics_of
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import plain_model
-from jbrep.play.film import Film, Pace, encode_mp4
+from jbrep.play.film import Film, Pace
 from jbrep.play.pictures import Camera, add_caption, band_height, find_camera
 from jbrep.play.sources import find_episode
 
@@ -178,15 +178,6 @@ def test_a_caption_keeps_to_its_band_and_to_its_room():
         add_caption(one, name, "return 712    9.96 s")
         add_caption(other, shown, "return 712    9.96 s")
         assert one == other
-
-
-def test_an_mp4_keeps_what_it_is_given(tmp_path):
-    ramp = np.tile(np.linspace(0, 255, 96, dtype=np.uint8)[None, :, None], (64, 1, 3))
-    encode_mp4(map(Image.fromarray, [ramp, ramp, 255 - ramp]), tmp_path / "a.mp4", 12.5)
-    frames, form = read_mp4(tmp_path / "a.mp4")
-    assert form[2] == 12.5
-    assert same(frames[1], ramp, 4)
-    assert same(frames[2], 255 - ramp, 4)
 
 
 @needs_egl

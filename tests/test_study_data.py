@@ -8,13 +8,10 @@ import pytest
 from command import start, wait_for, wait_for_the_end_of, workers_of
 from test_study import TINY
 
-from jbrep.collecting.policies import acts_on_observations
 from jbrep.dataset import Dataset
-from jbrep.dataset.manifest import read_manifest
 from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
-from jbrep.rl.policy_file import shipped_file
 from jbrep.studies.config import Data, as_study
 from jbrep.studies.plan import Plan
 from jbrep.studies.prepare import check, prepare
@@ -65,20 +62,6 @@ def test_representations_are_made_from_their_own_data(made):
         assert headers["late-s1"].data["policy"]["kind"] == "mixture"
         for name, number, table in (("pca-4", 0, "apart"), ("late-s1", 1, "mixed")):
             assert Dataset(made.data(task, number, table)).fingerprint == seen[name]
-
-
-def test_data_hold_what_the_mixture_says(made):
-    for task in STUDY.tasks:
-        folder = made.folder / "data" / "mixed" / task / "set-0"
-        settings = read_manifest(folder).settings
-        assert acts_on_observations(settings.policy)
-        kinds = [part["kind"] for _, part in settings.policy["parts"]]
-        weights = [weight for weight, _ in settings.policy["parts"]]
-        assert kinds == ["uniform", "heuristic", "trained"]
-        assert weights == pytest.approx([0.4, 0.3, 0.3])
-        assert (folder / "policy-0.safetensors").read_bytes() == shipped_file(task).read_bytes()
-        dataset = Dataset(folder)
-        assert (len(dataset["action"]), dataset.task.name) == (600, task)
 
 
 def test_two_workers_make_the_same_bytes(made, tmp_path, capfd):

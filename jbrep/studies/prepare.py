@@ -228,7 +228,7 @@ def policies(plan: Plan) -> dict[str, str]:
 
 
 def say(line: str) -> None:
-    """Print a line on standard error, above a live table; a study goes on where that fails."""
+    """Print a line on standard error; a study goes on where that fails."""
     if sys.stderr is not None:
         with suppress(OSError):
             print(line, file=sys.stderr, flush=True)
