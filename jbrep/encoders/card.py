@@ -60,6 +60,8 @@ def _layers(layers: Layers) -> list[dict[str, Any]]:
 
 def _said(value: Any) -> str:
     """As latent 8, policy (kind uniform)."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if not isinstance(value, Mapping):
         return str(value)
     parts = (
