@@ -8,7 +8,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TypeVar, cast
 
 import click
@@ -58,6 +58,33 @@ def _notices() -> Iterator[None]:
 
 
 @contextmanager
+def _own_output() -> Iterator[None]:
+    """Keep standard output for jbrep: what an environment's C code prints there is an error's."""
+    try:
+        is_usual = (sys.stdout.fileno(), sys.stderr.fileno()) == (1, 2)
+    except (AttributeError, OSError, ValueError):
+        is_usual = False
+    if not is_usual:
+        yield
+        return
+    before, sys_before, kept = sys.stdout, sys.__stdout__, os.dup(1)
+    before.flush()
+    os.dup2(2, 1)
+    own = os.fdopen(kept, "w", encoding=before.encoding, errors=before.errors)
+    own.reconfigure(line_buffering=own.isatty())
+    sys.stdout = sys.__stdout__ = own  # type: ignore[misc]
+    try:
+        yield
+    finally:
+        with suppress(OSError, ValueError):  # such as a pipe that nobody reads
+            own.flush()
+        os.dup2(kept, 1)
+        sys.stdout, sys.__stdout__ = before, sys_before  # type: ignore[misc]
+        with suppress(OSError, ValueError):
+            own.close()
+
+
+@contextmanager
 def _closing() -> Iterator[None]:
     """Close every environment at the end, also where SIGTERM is the end: it may be a robot."""
     is_main = threading.current_thread() is threading.main_thread()
@@ -81,7 +108,7 @@ class _Cli(click.Group):
         self.format_commands(ctx, formatter)
 
     def main(self, *args: Any, **options: Any) -> Any:
-        with _notices(), _closing():
+        with _own_output(), _notices(), _closing():
             return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> None:
@@ -150,7 +177,7 @@ def say(text: str, err: bool = False) -> None:
     try:
         click.echo("\n".join(map(printable, text.split("\n"))), err=err)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2 if err else 1)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), (sys.stderr if err else sys.stdout).fileno())
 
 
 def tell(line: str, err: bool = False) -> None:

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim, flatten_space
 from numpy.typing import NDArray
 
+from jbrep.envs.aside import in_time
 from jbrep.envs.infos import number_of
 from jbrep.envs.make import Env, action_in, discard, flattener, give_back, number, of_size, take
 from jbrep.envs.names import find_spec
@@ -94,13 +95,15 @@ def _play(env: Env, seed: int, most: int, still: bool = False) -> Iterator[_Step
     random, flat = np.random.default_rng(seed), flattener(env.observation_space)
     space: Any = env.action_space
     size, middle = flatdim(env.observation_space), (space.low + space.high) / 2
-    observation, info = env.reset(seed=seed)
+    with in_time():
+        observation, info = env.reset(seed=seed)
     if not isinstance(info, Mapping):
         raise ValueError("its reset must give an observation and info, as in Gymnasium")
     yield _Step(of_size(np.array(flat(observation)), size), 0.0, False, False)
     for _ in range(most):
         action = middle if still else random.uniform(space.low, space.high)
-        observation, reward, terminated, truncated, _ = env.step(action_in(space, action))
+        with in_time():
+            observation, reward, terminated, truncated, _ = env.step(action_in(space, action))
         ends = bool(number(terminated, "terminated")), bool(number(truncated, "truncated"))
         yield _Step(of_size(np.array(flat(observation)), size), number(reward, "reward"), *ends)
         if any(ends):

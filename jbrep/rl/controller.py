@@ -18,7 +18,7 @@ from jbrep.encoders.encoder import Encoder, load
 from jbrep.encoders.layers import ACTIVATIONS, ONNX, Layer, activate, dense, run
 from jbrep.envs.recording import held
 from jbrep.envs.view import Window
-from jbrep.errors import InputError, choose, listed
+from jbrep.errors import InputError, choose, listed, refusing
 from jbrep.records.container import Tensors, without
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists, taken, write_new
@@ -248,8 +248,9 @@ def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
         raise InputError(f"{file.path} is of a run on another encoder than {encoder.name}")
     encoder.check_task(settings.environment)
     normalized = settings.hyperparameters.normalize
-    statistics = Statistics.read(file.tensors) if normalized else None
-    return Controller(settings, encoder, weights, statistics)
+    with refusing(f"{file.path} doesn't fit the run's settings", (LookupError, ValueError)):
+        statistics = Statistics.read(file.tensors) if normalized else None
+        return Controller(settings, encoder, weights, statistics)
 
 
 def export(controller: Controller, path: Path, form: str = "onnx") -> None:
