@@ -160,7 +160,7 @@ def test_what_a_policy_lacks_is_named(tmp_path):
     del tensors["policy.mu.bias"]
     path = tmp_path / "policy.safetensors"
     container.write(path, tensors, header)
-    with pytest.raises(InputError, match="doesn't fit the run's settings: .*mu"):
+    with pytest.raises(InputError, match=r"doesn't fit the run's settings: .*mu"):
         load_policy(path)
 
 
