@@ -24,7 +24,7 @@ from jbrep import jitterbug
 from jbrep.encoders import find
 from jbrep.envs import describe
 from jbrep.rl import train
-from jbrep.rl.agent import make_agent, make_env
+from jbrep.rl.agent import make_agent, make_env, noise_of
 from jbrep.rl.presets import get_preset
 from jbrep.studies.config import Study
 from jbrep.studies.plan import Plan
@@ -52,7 +52,7 @@ def agent_on_shimmy() -> Any:
     environment = FlattenObservation(DmControlCompatibilityV0(jitterbug.load(TASK, seed=0)))
     network = {"net_arch": list(preset.net_arch), "activation_fn": torch.nn.ReLU}
     assert preset.noise
-    noise = preset.noise.make(1, 1000)
+    noise = noise_of(preset.noise, 1, 1000)
     kwargs: dict[str, Any] = {
         "seed": 0,
         "device": "cpu",

@@ -109,7 +109,7 @@ def make_agent(
     of_policy, of_adam = hyperparameters.policy_kwargs, hyperparameters.optimizer_kwargs
     if hyperparameters.noise:
         size = int(np.prod(env.action_space.shape or (), dtype=int))
-        of_class["action_noise"] = _noise(hyperparameters.noise, size, episode_steps)
+        of_class["action_noise"] = noise_of(hyperparameters.noise, size, episode_steps)
     with warnings.catch_warnings(record=True) as told:
         agent: Any = sb3_class(algorithm)(
             "MlpPolicy",
@@ -177,7 +177,7 @@ class ColouredActionNoise(ActionNoise):
         self.ahead = np.zeros((0, self._shape[0]))
 
 
-def _noise(chosen: Any, size: int, steps: int) -> ActionNoise:
+def noise_of(chosen: Any, size: int, steps: int) -> ActionNoise:
     match chosen:
         case NormalNoise(sigma=sigma):
             return NormalActionNoise(np.zeros(size), np.full(size, sigma))
