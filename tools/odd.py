@@ -1,6 +1,7 @@
 """Play environments of each oddity by every command, at each moment: python tools/odd.py.
 
-Words after it are the oddities to try. It prints what goes wrong, and ends with code 1 where anything does.
+Words after it are the oddities to try. It prints what goes wrong, and ends with code 1 where
+anything does.
 """
 
 import sys

@@ -178,6 +178,7 @@ class ColouredActionNoise(ActionNoise):
 
 
 def noise_of(chosen: Any, size: int, steps: int) -> ActionNoise:
+    """stable-baselines3's noise of actions of a size, for episodes of so many steps."""
     match chosen:
         case NormalNoise(sigma=sigma):
             return NormalActionNoise(np.zeros(size), np.full(size, sigma))
