@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent.parent
-SHOWN = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "LICENSE")
+SHOWN = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "CITATION.cff", "LICENSE")
 FOLDERS = ("docs", "results", "examples", "studies", "jbrep", "benchmarks", "data/sample")
 LEFT_OUT = shutil.ignore_patterns("*.safetensors", "*.h5", "__pycache__")
 
