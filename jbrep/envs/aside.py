@@ -84,10 +84,12 @@ _QUICK = {
 
 
 @cache
-def _of_torch(torch: Any) -> dict[str, _Global]:
-    if not hasattr(torch, "get_rng_state"):  # it isn't imported, or only just so
-        return {}
-    return {
+def _globals(in_episode: bool, torch: Any) -> dict[str, _Global]:
+    """What is looked at, with torch if that is imported."""
+    known = _QUICK if in_episode else _QUICK | _SLOW
+    if torch is None:
+        return known
+    return known | {
         "torch's type": _Global(torch.get_default_dtype, torch.set_default_dtype),
         "torch's gradients": _Global(torch.is_grad_enabled, torch.set_grad_enabled),
         "torch's threads": _Global(torch.get_num_threads, torch.set_num_threads),
@@ -163,7 +165,8 @@ def aside(in_episode: bool = False) -> Iterator[None]:
     if _inside:
         yield
         return
-    every = _QUICK | ({} if in_episode else _SLOW) | _of_torch(sys.modules.get("torch"))
+    torch = sys.modules.get("torch")  # which may only just be being imported
+    every = _globals(in_episode, torch if hasattr(torch, "get_rng_state") else None)
     ours = {name: each.get() for name, each in every.items()}
     for name in _theirs.keys() & every.keys():
         every[name].put(_theirs[name])

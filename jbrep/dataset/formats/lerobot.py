@@ -69,7 +69,8 @@ def read(given: str) -> Frame:
     if not paths:
         raise InputError(f"{given} has no data/chunk-*/*.parquet: download it whole")
     with opened(paths[0]) as file:
-        schema = measured(file.schema_arrow, next(file.iter_batches(PEEKED), None))
+        first = next(file.iter_batches(PEEKED), None)
+        schema = measured(file.schema_arrow, first)
     rows = 0
     for path in paths:
         with opened(path) as file:
@@ -92,18 +93,15 @@ def read(given: str) -> Frame:
         unusable=dict.fromkeys(images, "images"),
         layout=Layout(observations=tuple(seen), actions=("action",)),
         timestep=1 / fps,
-        notes=_clock_notes(paths[0], schema, fps),
+        notes=_clock_notes(first, fps),
     )
 
 
-def _clock_notes(path: Path, schema: pa.Schema, fps: float) -> tuple[str, ...]:
+def _clock_notes(first: pa.RecordBatch | None, fps: float) -> tuple[str, ...]:
     """What to say where the first rows' own times contradict the rate."""
-    if "timestamp" not in schema.names:
+    if first is None or "timestamp" not in first.schema.names:
         return ()
-    with opened(path) as file:
-        batch = next(file.iter_batches(PEEKED, columns=["timestamp"]), None)
-    times = np.array([] if batch is None else batch.column(0), np.float64)
-    step = timestep_of(np.diff(times))
+    step = timestep_of(np.diff(np.array(first.column("timestamp"), np.float64)))
     if same_clock(step, 1 / fps):
         return ()
     clocks = f"timestamps are {step:.4g} s apart, and {INFO} says {fps:g} frames a second"

@@ -54,12 +54,11 @@ class Source:
         has_changed: whether its files have, since they were opened.
     """
 
-    has_changed: Callable[[], bool] = staticmethod(lambda: False)
-
     def __init__(self, frame: Frame, given: Layout | None = None, missing: str = ""):
         self.frame, self._layout = frame, _both(frame, given or Layout())
         self._roles, rate = roles_of(frame, self._layout), self._layout.rate
         self._counts, self._others = Counts(), tuple[Source, ...]()
+        self.has_changed: Callable[[], bool] = lambda: False
         self._may_miss = (*WIDE, "reward") if missing or rate else ()
         used = [(role, leaf.column) for role, some in self._roles.items() for leaf in some]
         self._columns = list(dict.fromkeys(column for _, column in used))
