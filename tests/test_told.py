@@ -12,6 +12,7 @@ from foreign import imported, lerobot_folder, not_imported, write_bag, write_csv
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from jbrep.dataset import Layout
 from jbrep.dataset.formats import open_sources
 from jbrep.dataset.formats.writer import write
 from jbrep.envs.task import MAX_FEATURES
@@ -25,7 +26,7 @@ NAMED = ("--actions", "u", "--time", "t")
 def test_a_rate_that_timestamps_contradict(tmp_path):
     folder = lerobot_folder(tmp_path / "le")
     info = json.loads((folder / "meta/info.json").read_text()) | {"fps": 15}
-    assert "contradict" not in imported(folder, out="plain")[0]
+    assert "timestamps are" not in imported(folder, out="plain")[0]
     (folder / "meta/info.json").write_text(json.dumps(info))
     told, data = imported(folder, out="rate")
     assert "timestamps are 0.03333 s apart" in told
@@ -107,8 +108,6 @@ def test_bags_without_metadata_and_columns_without_readings(tmp_path):
 
 def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path):
     path = write_csv(tmp_path / "a.csv", TABLE)
-    from jbrep.dataset import Layout
-
     source = open_sources([str(path)], Layout(actions=("u",), time="t"))
     os.utime(path, ns=(1, 1))
     with pytest.raises(InputError, match="changed while it was imported"):
@@ -138,3 +137,16 @@ def test_more_features_than_a_shard_names_are_refused_at_once(tmp_path):
     assert "observation" in not_imported(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", observations=np.zeros((9, MAX_FEATURES), "f4"), **rows)
     assert imported(tmp_path / "b.npz")[1].task.size == MAX_FEATURES
+
+
+@pytest.mark.parametrize("separator", [",", "\t", "|"])
+def test_marks_of_thousands_are_never_taken_for_decimal_ones(separator, tmp_path):
+    def log(name, cell):
+        rows = [["t", "x", "u"], *([f"{i}", f'"{cell}"', f'"{i}"'] for i in range(9))]
+        path = tmp_path / name
+        path.write_text("\n".join(separator.join(row) for row in rows) + "\n")
+        return path
+
+    assert "1,234" in not_imported(log("a.csv", "1,234"), *NAMED)
+    _, data = imported(log("b.csv", "0,234"), *NAMED)
+    assert data["x"][0] == np.float32(0.234)

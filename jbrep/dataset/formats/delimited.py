@@ -28,7 +28,7 @@ _TELLING = {*RADIANS, *DEGREES, *SECONDS}  # units that change what numbers mean
 _PLACE = re.compile(r"\w[\[(]\d+[\])]$")  # of q[0], which is no unit
 _LONG = re.compile(r"-?\d{16,}")  # whole numbers that may lose digits as floats
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-_THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")
 _NUMBERS, _TIMES = (pa.float64(), pa.bool_()), (pa.timestamp("ns"), pa.timestamp("ns", "UTC"))
 _TIME_FORMS = (  # of loggers, and what stands for them in ISO 8601
     (r",(\d{1,9})", r".\1"),  # Python's logging: 11:59:58,010
@@ -82,7 +82,7 @@ def _form(path: Path) -> _Form:
     for i, name in enumerate(names):
         cells = [row[i] for row in rows if i < len(row) and row[i] not in _EMPTY]
         types.append(_type(cells[0], decimal) if cells else pa.float64())
-        if types[i] == pa.string() and (kind := _type(_iso(cells[0]))) in _TIMES:
+        if types[i] == pa.string() and (kind := _type(_iso_cell(cells[0]))) in _TIMES:
             types[i] = kind
             rewritten.add(name)
     schema = pa.schema(zip(names, types, strict=True))
@@ -103,9 +103,9 @@ def _head(path: Path) -> tuple[int, str, list[str]]:
 
 
 def _decimal(path: Path, separator: str, cells: list[str]) -> str:
-    """The decimal mark; between commas, a cell with one was quoted, as are thousands."""
+    """The decimal mark; only between semicolons a comma is surely one, and no mark of thousands."""
     commas = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)]
-    if separator == "," and commas and all(map(_THOUSANDS.fullmatch, commas)):
+    if separator != ";" and commas and all(map(_THOUSANDS.fullmatch, commas)):
         raise InputError(
             f"{path} has numbers such as {commas[0]}, of which it can't be told whether the comma "
             "is a decimal mark: write them without marks for thousands"
@@ -115,7 +115,7 @@ def _decimal(path: Path, separator: str, cells: list[str]) -> str:
 
 def _is_line_of_units(row: list[str], following: list[str]) -> bool:
     def has_value(cells: list[str]) -> bool:
-        return any(c and (c in _MISSING or _type(_iso(c), ",") != pa.string()) for c in cells)
+        return any(c and (c in _MISSING or _type(_iso_cell(c), ",") != pa.string()) for c in cells)
 
     return any(row) and not has_value(row) and has_value(following)
 
@@ -143,11 +143,15 @@ def _type(cell: str, decimal: str = ".") -> pa.DataType:
     return pa.string()
 
 
-def _iso(cell: str) -> str:
-    """A time as ISO 8601 has it."""
+def _iso_cell(cell: str) -> str:
+    return str(_iso(pa.array([cell]))[0])
+
+
+def _iso(cells: pa.Array) -> pa.Array:
+    """Times as ISO 8601 has them."""
     for pattern, instead in _TIME_FORMS:
-        cell = re.sub(pattern, instead, cell)
-    return cell
+        cells = pc.replace_substring_regex(cells, pattern, instead)
+    return cells
 
 
 def _batches(path: Path, form: _Form, columns: list[str]) -> Iterator[pa.RecordBatch]:
@@ -173,10 +177,8 @@ def _batches(path: Path, form: _Form, columns: list[str]) -> Iterator[pa.RecordB
 
 def _with_times(batch: pa.RecordBatch, form: _Form) -> pa.RecordBatch:
     for name in form.rewritten & {*batch.schema.names}:
-        i, cells = batch.schema.get_field_index(name), batch.column(name)
-        for pattern, instead in _TIME_FORMS:
-            cells = pc.replace_substring_regex(cells, pattern, instead)
-        batch = batch.set_column(i, name, cells.cast(form.schema.field(name).type))
+        i, kind = batch.schema.get_field_index(name), form.schema.field(name).type
+        batch = batch.set_column(i, name, _iso(batch.column(name)).cast(kind))
     return batch
 
 
