@@ -96,8 +96,9 @@ def _messages(reader: AnyReader, topics: set[str]) -> Iterator[_Numbers]:
 
     Where the recorder's clock was set back, they are those before that, then those after it.
     """
-    connections, clocks = [c for c in reader.connections if c.topic in topics], _clocks(reader)
-    for clock in range(1 + max(map(max, clocks.values()), default=-1)):
+    connections = [each for each in reader.connections if each.topic in topics]
+    clocks = _clocks(reader, topics)
+    for clock in range(1 + max(map(max, filter(None, clocks.values())), default=-1)):
         own = {topic: iter(each) for topic, each in clocks.items()}
         for message in reader.messages(connections):
             if next(own[message[0].topic]) == clock:
@@ -112,18 +113,20 @@ def _read(reader: AnyReader, connection: Any, time: int, raw: bytes) -> _Numbers
     return {_TIME: time, **dict(_numbers(message, connection.topic, 0))}
 
 
-def _clocks(reader: AnyReader) -> dict[str, list[int]]:
-    """Of a topic's messages, by their times: how often the clock had been set back before each.
+def _clocks(reader: AnyReader, topics: set[str]) -> dict[str, list[int]]:
+    """Of each topic's messages, by their times: how often the clock was set back before each.
 
     A topic's own messages are written in order, so that one with an earlier time has another clock;
     those of several topics may be a little out of order.
     """
-    latest, count, found = dict[str, int](), 0, dict[str, list[tuple[int, int]]]()
+    latest, count = dict[str, int](), 0
+    found: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
     for topic, time in _recorded(reader):
         if time < latest.get(topic, time):
             latest, count = {}, count + 1
         latest[topic] = time
-        found.setdefault(topic, []).append((time, count))
+        if topic in topics:
+            found[topic].append((time, count))
     return {
         topic: [clock for _, clock in sorted(some, key=itemgetter(0))]
         for topic, some in found.items()
