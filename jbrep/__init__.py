@@ -19,6 +19,7 @@ from jbrep.lazy import exports
 if TYPE_CHECKING:
     from jbrep.api import collect as collect
     from jbrep.api import evaluate as evaluate
+    from jbrep.api import evaluate_policy as evaluate_policy
     from jbrep.api import report as report
     from jbrep.api import study as study
     from jbrep.api import train as train

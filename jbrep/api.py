@@ -18,8 +18,10 @@ from jbrep.dataset.settings import RootSeed, ShardEpisodes, Steps, StoreState
 from jbrep.errors import InputError, Notice, choose
 from jbrep.parameters import (
     NOTHING,
+    Acting,
     Algorithm,
     Backend,
+    Episodes,
     GivenDrawnTask,
     GivenTask,
     Lanes,
@@ -115,7 +117,7 @@ def collect(
     out: str | Path,
     steps: Steps,
     *,
-    policy: str = "uniform",
+    policy: Acting = "uniform",
     seed: RootSeed = 0,
     store_state: StoreState = False,
     shard_episodes: ShardEpisodes | None = None,
@@ -137,7 +139,9 @@ def collect(
         out: a folder: new, or with an unfinished or smaller data set of the same settings.
         policy: what acts: uniform, constant:drive=0.5, for the Jitterbug heuristic and trained (see
             jbrep policies), ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3; the folder of a run; or
-            several with weights, of which each episode has one: uniform:0.5+runs/a:0.5.
+            several with weights, of which each episode has one: uniform:0.5+runs/a:0.5; or your
+            own: mymodule:act, a function of an observation, a class of such, or a model of
+            stable-baselines3.
     """
     from jbrep.collecting.collector import collect as run
     from jbrep.collecting.collector import usual_shard_episodes
@@ -229,7 +233,7 @@ def evaluate(
     data: "Dataset | str | Path",
     out: str | Path | None = None,
     *,
-    policy: str | None = None,
+    policy: Acting | None = None,
     truth: "Dataset | str | Path | None" = None,
 ) -> Judged:
     """Judge encoders on the held-out part of a data set.
@@ -266,6 +270,30 @@ def evaluate(
     if out is None:
         return Judged(diagnose(found, scaled, good, whole))
     return Judged(write(found, scaled, Path(out), good, whole))
+
+
+def evaluate_policy(
+    policy: Acting,
+    task: "Task | str | None" = None,
+    *,
+    episodes: Episodes = 20,
+    threads: Threads = None,
+    retries: Retries = 0,
+) -> "NDArray[np.float64]":
+    """Play a policy in the first of the episodes that every run is evaluated on.
+
+    Args:
+        policy: as `collect` takes it, or the file of an exported one.
+        task: that is played, which a policy by name or of your own needs.
+
+    Returns:
+        Returns of the episodes, (episodes,).
+    """
+    from jbrep.envs.description import as_task
+    from jbrep.play.sources import find_player
+
+    player = find_player(policy, None if task is None else as_task(task))
+    return player.returns(episodes, threads, retries)
 
 
 def train(

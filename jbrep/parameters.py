@@ -107,6 +107,7 @@ Seen = Annotated[
         extra={"is_code": True},
     ),
 ]
+Acting = Annotated[Any, Meta(extra={"is_code": True})]  # a policy by a name or its code, or itself
 AsJson = Annotated[bool, Meta(description="As JSON, for programs.", extra={"option": "json"})]
 
 

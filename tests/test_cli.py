@@ -48,13 +48,6 @@ def test_a_run_from_training_to_its_returns(tmp_path):
     assert re.fullmatch(
         r"face_direction on dae-8: median return [\d.]+ \[[\d.]+, [\d.]+\] .*\n", told
     )
-    policy = shutil.copy(run / "policy.zip", tmp_path / "elsewhere.zip")
-    refused = jbrep("evaluate-policy", policy)
-    assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
-    assert "runs as code when it is read; add --trust" in refused.output
-    zip_file = ("--trust", "--task", "face_direction", "--episode-steps", 100)
-    zip_file += ("--algorithm", "a2c", "--encoder", "dae-8")
-    assert jbrep("evaluate-policy", policy, "--episodes", 2, *zip_file).output.endswith(told)
     table = jbrep("report", tmp_path / "runs").output.splitlines()
     assert ["face_direction/a2c/dae-8", "0", "finished"] in [line.split()[:3] for line in table]
     why = "face_direction/a2c/dae-8: one run has ended, at least two are needed"

@@ -180,5 +180,5 @@ def test_commands_take_what_is_seen(tmp_path, monkeypatch):
     assert "made for other features" in mistake(*f"rl {task} {given} --out other".split())
     run(f"rl {task} {hide} {given} --out run")
     run("policy export run --out it.onnx")
-    told = run("policy check it.onnx --run run --episodes 2")
+    told = run("evaluate-policy it.onnx --beside run --episodes 2")
     assert float(told.rpartition("differs by more than ")[2]) < 1e-5

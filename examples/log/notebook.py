@@ -16,7 +16,6 @@ from record import record
 
 import jbrep
 from jbrep.dataset import Layout, from_file
-from jbrep.play.sources import exported_player, find_player
 from jbrep.rl.controller import export, load_policy
 from jbrep.rl.policy_file import find_shipped as find
 
@@ -87,7 +86,7 @@ print(agent)
 
 # %%
 export(agent.policy, OUT / "controller.onnx")
-alone = exported_player(OUT / "controller.onnx", task).returns(5)
-run = find_player(str(OUT / "run"), task).returns(5)
+alone = jbrep.evaluate_policy(OUT / "controller.onnx", task, episodes=5)
+run = jbrep.evaluate_policy(OUT / "run", task, episodes=5)
 print(f"the controller returns {np.median(alone):.1f}, its run {np.median(run):.1f} (medians of 5)")
 print(f"the log's, which had learned for longer, {np.median(earlier):.1f}")

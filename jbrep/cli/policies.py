@@ -1,7 +1,6 @@
 """What policies do, and taking one out for a robot."""
 
 import shlex
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,18 +14,17 @@ from jbrep.parameters import (
     AsJson,
     Episodes,
     NewFile,
-    OptionalTask,
     Retries,
     TaskName,
     Threads,
     described,
 )
 from jbrep.records.record import to_plain
-from jbrep.text import counted, interval_of, percentiles, returns_text, table, terminal_width
+from jbrep.rl.policy_file import SHIPPED
+from jbrep.text import counted, interval_of, percentiles, table, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.envs.infos import Numbers
-    from jbrep.envs.task import Task
     from jbrep.play.player import Player
 
 _TASK = "face_direction"
@@ -78,7 +76,6 @@ def export(
     from jbrep.play.sources import policy_file
     from jbrep.rl.controller import described, load_policy
     from jbrep.rl.controller import export as write
-    from jbrep.rl.policy_file import SHIPPED
 
     if task and policy != SHIPPED:
         raise InputError(
@@ -92,58 +89,22 @@ def export(
     say(f"{out}: {own.size} numbers of {own.name} to {own.action_size}{rate}")
     if form == "onnx":
         modules = [f"--import={module}" for module in modules_of(own)]
-        check = ["jbrep", "policy", "check", str(out), "--run", policy, *modules]
-        say(f"check it with {shlex.join(check + (['--task', task] if task else []))}")
+        check = ["jbrep", "evaluate-policy", str(out), "--beside", policy, *modules]
+        say(f"check it with {shlex.join(check)}")
     else:
         say(f"open it with torch.export.load({str(out)!r}).module()")
 
 
-@command("policy check controller.onnx --run runs/a")
-def check(
-    model: Path,
-    /,
-    *,
-    run: str | None = None,
-    episodes: Episodes = 20,
-    threads: Threads = None,
-    retries: Retries = 0,
-    task: OptionalTask = None,
-) -> None:
-    """Play an exported policy in its environment.
-
-    MODEL is an ONNX file that jbrep policy export wrote. It plays the episodes that every run is
-    evaluated on; with `run`, that run plays the same ones.
-
-    Args:
-        run: the run that it was exported from, or trained, to play beside it.
-    """
-    import numpy as np
-
-    from jbrep.play.sources import exported_player, find_player
-
-    beside = find_player(run, task) if run else None
-    player = exported_player(model, beside.task if beside else task)
-    returns = player.returns(episodes, threads, retries)
-    say(f"{player.task.name}, {model}: {returns_text(returns)}")
-    if beside:
-        theirs = beside.returns(episodes, threads, retries)
-        apart = float(np.abs(returns - theirs).max())
-        said = f"{beside.name}: {interval_of(theirs)}"
-        say(f"{said}; no episode's return differs by more than {apart:.3g}")
-
-
 @command("evaluate-policy runs/a --episodes 100")
 def evaluate_policy(
-    policy: str,
+    policy: Annotated[str, Meta(extra={"is_code": True})],
     /,
     *,
     episodes: Episodes = 20,
-    trust: bool = False,
     threads: Threads = None,
     retries: Retries = 0,
-    algorithm: Annotated[str, Meta(extra={"default": "sac"})] = "",
-    vecnormalize: Annotated[Path | None, Meta(extra={"metavar": "FILE"})] = None,
     encoder: Annotated[str | None, Meta(extra={"is_code": True})] = None,
+    beside: str | None = None,
     perturb: Annotated[
         Sequence[str], Meta(extra={"metavar": "[NAME=VALUE]", "click": _MAYBE})
     ] = (),
@@ -153,25 +114,21 @@ def evaluate_policy(
 ) -> bool:
     """Show the returns of a policy.
 
-    POLICY is a folder of jbrep rl, a zip file that stable-baselines3 wrote, or a policy by its
-    name, such as heuristic, or trained, which ships. A name is played on face_direction unless
-    --task is given; a zip file needs it unless jbrep wrote it. A run that is under way or was
-    stopped plays its last checkpoint. Of a folder only numbers are read. A zip file from elsewhere
-    runs as code when it is opened, so it needs --trust; its agent sees what the environment gives,
-    unless jbrep wrote it, or --encoder and --vecnormalize say what it was trained on. A policy by
-    name may act on what an encoder's latent is decoded to: the return that it loses measures what
-    the latent lacks.
+    POLICY is a folder of jbrep rl, a file that jbrep policy export wrote, a policy by its name,
+    such as heuristic, or trained, which ships, or your own: mymodule:act, a function of an
+    observation, a class of such, or a model of stable-baselines3. A name is played on
+    face_direction unless --task is given; your own needs it. A run that is under way or was stopped
+    plays its last checkpoint. A policy by name may act on what an encoder's latent is decoded to:
+    the return that it loses measures what the latent lacks.
 
     With --perturb they are a table: how much of its return a policy keeps where sensors are noisy
     or late, readings are lost, the body or the physics is another, or the robot is pushed.
 
     Args:
-        trust: read a zip file from elsewhere, which can run code.
-        algorithm: of a zip file.
-        vecnormalize: what VecNormalize.save wrote, if a zip file's agent was trained behind that.
-        encoder: what a zip file was trained on, or what a policy by name observes through: a file,
-            the name of one that ships, or code, mymodule:MyEncoder; of a run that was made with
-            code, that.
+        encoder: what a policy by name observes through: a file, the name of one that ships, or
+            code, mymodule:MyEncoder; of a run that was made with code, that.
+        beside: another policy, such as the run that a file was exported from: it plays the same
+            episodes, whose returns are compared.
         perturb: play the episodes undisturbed, then with noise, delays, other bodies, pushes, ...:
             all that there can be, or what is named, as in --perturb delay=2 or
             noise=0.1,delay=1..3; may be repeated.
@@ -181,7 +138,6 @@ def evaluate_policy(
     from jbrep.envs.infos import Numbers
     from jbrep.envs.lanes import EnvironmentFailedError
     from jbrep.play.perturbed import read_perturbation
-    from jbrep.play.sources import is_by_name
     from jbrep.records.storage import exists, taken
 
     chosen = [each for each in perturb if each]
@@ -191,10 +147,7 @@ def evaluate_policy(
         raise InputError("--out is for the table of --perturb: add that")
     if out and exists(out):
         raise taken(out)
-    if is_by_name(policy):
-        options.setdefault("task", _TASK)
-    of_zip = {"algorithm": algorithm, "trust": trust, "vecnormalize": vecnormalize}
-    player = _find(policy, described(**options), encoder, **of_zip)
+    player = _find(policy, encoder, options)
     source = None if encoder is None else source_of(encoder, player.task)
     if perturb:
         _perturb(policy, player, chosen, (episodes, threads, retries), out, as_json)
@@ -209,6 +162,8 @@ def evaluate_policy(
             raise
         failure = str(error)
     _show_returns(policy, player, source, returns, numbers, as_json)
+    if beside and not failure:
+        _compare(beside, player, returns, (episodes, threads, retries))
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
     return bool(failure)
@@ -245,6 +200,19 @@ def _show_returns(
     if told := shares_text(by_name(numbers)):
         tell(told)
     return None
+
+
+def _compare(
+    other: str, player: "Player", returns: list[float], how: tuple[int, int | None, int]
+) -> None:
+    """Show what another policy returns in the same episodes."""
+    from jbrep.play.sources import find_player
+
+    beside = find_player(other, player.task)
+    theirs = beside.returns(*how)
+    apart = max(abs(own - its) for own, its in zip(returns, theirs.tolist(), strict=True))
+    told = f"{beside.name}: {interval_of(theirs)}; no episode's return differs by more than"
+    tell(f"{told} {apart:.3g}")
 
 
 def _perturb(
@@ -285,49 +253,25 @@ def _perturb(
 
 def _title(policy: str, player: "Player") -> str:
     """The task, and what is not in the command: what a trained policy observes, its step."""
-    from jbrep.play.sources import is_by_name
+    from jbrep.play.sources import is_by_name, is_exported
 
-    if is_by_name(policy):
+    if is_by_name(policy) or is_exported(policy):
         return f"{player.task.name}, {player.name}"
     step = "" if player.step is None else f" at step {player.step:,}"
     return f"{player.task.name} on {player.representation}{step}"
 
 
-def _find(policy: str, task: "Task | None", encoder: str | None, **of_zip: Any) -> "Player":
-    """The policy of a run, by name, or in a zip file, which options are about."""
+def _find(policy: str, encoder: str | None, options: dict[str, Any]) -> "Player":
+    """The policy on the task of these options, maybe on what an encoder's latent is decoded to."""
     from jbrep.encoders import find
+    from jbrep.envs.names import is_code
     from jbrep.play import sources
 
-    path, folder = Path(policy), sources.run_folder(policy)
-    is_run = sources.is_trained(policy) or path.is_dir()
-    is_zip = not (is_run or sources.is_by_name(policy))
-    if not is_zip and (unused := [name for name, given in of_zip.items() if given]):
-        raise InputError(f"--{unused[0]} is for zip files from elsewhere: leave it out")
-    if is_run:
-        if encoder and not (folder and encoder == _code_of(folder)):
-            raise InputError(
-                f"{policy} is a trained policy, which has its own encoder: leave out --encoder"
-            )
-        return sources.find_player(policy, task)
-    if sources.is_by_name(policy):
-        player = sources.find_player(policy, task)
-        return player.with_reconstruction(find(encoder, player.task)) if encoder else player
-    if not zipfile.is_zipfile(path):
-        raise InputError(
-            f"no policy at {policy}: a folder of jbrep rl is needed, a zip file of "
-            f"stable-baselines3, or a name: {sources.policy_names()}"
-        )
-    from jbrep.rl.policy_zip import load_zip  # imports torch
-
-    algorithm = of_zip.pop("algorithm") or "sac"
-    found = load_zip(path, task, algorithm, encoder, **of_zip)
-    if found.note:
-        say(f"note: {found.note}", err=True)
-    return sources.as_player(policy, found.trained, task)
-
-
-def _code_of(folder: Path) -> str | None:
-    """The code of the encoder that a run was made with, if it is code."""
-    from jbrep.rl.checkpoint import run_settings  # imports torch
-
-    return run_settings(folder).encoder_code
+    by_name = sources.is_by_name(policy)
+    if by_name and not is_code(policy):
+        options.setdefault("task", _TASK)
+    task = described(**options)
+    if encoder is None or not by_name or policy == SHIPPED:
+        return sources.find_player(policy, task, encoder)
+    player = sources.find_player(policy, task)
+    return player.with_reconstruction(find(encoder, player.task))

@@ -14,9 +14,10 @@ from jbrep.collecting.replay import replay_problems
 from jbrep.collecting.shards import Growth, Produce
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import Manifest, new_manifest, open_shard, policy_files, shard_image
-from jbrep.dataset.rewards import reward_function, with_hash, without_range
+from jbrep.dataset.rewards import reward_function, without_range
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns, some_episodes
 from jbrep.envs.lanes import check_counts
+from jbrep.envs.names import with_digest
 from jbrep.envs.recording import Tick
 from jbrep.envs.task import Task
 from jbrep.envs.view import seen_in_episodes, with_view
@@ -87,7 +88,8 @@ def derive_view(
     changes = list[Callable[[Columns], Columns]]()
     if reward:
         task = without_range(settings.task)
-        settings = settings.replace(task=task, reward=with_hash(reward), unrewarded=UNSET)
+        named = with_digest(reward, "reward")
+        settings = settings.replace(task=task, reward=named, unrewarded=UNSET)
         changes.append(_rewarded(reward))
     if hidden or history > 1:
         settings = settings.replace(task=with_view(settings.task, hidden, history))

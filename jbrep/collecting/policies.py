@@ -1,10 +1,10 @@
-"""Policies to collect with, each determined by its kind and a few constants."""
+"""Policies to collect with: by a kind and a few constants, or a user's own."""
 
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.schema import episode_part
 from jbrep.dataset.settings import MIXTURE, TRAINED, parts_of
+from jbrep.envs.names import code_named, digest_of, is_code, with_digest
 from jbrep.envs.recording import Actor as Actor
 from jbrep.envs.recording import open_loop
 from jbrep.envs.task import Array, Task
-from jbrep.errors import InputError, choose
+from jbrep.errors import InputError, choose, refusing
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.records.record import Record, from_plain, to_plain
 
@@ -185,6 +186,93 @@ class Mixture:
         return act
 
 
+@dataclass(frozen=True)
+class Own:
+    """A user's own: a function, a class of functions, or a model of stable-baselines3.
+
+    A function takes an observation (d,) and gives an action (k,). A class has an instance for each
+    episode, which begins with what it remembers. Where the attribute `batched` is true, one call
+    takes the observations of n episodes, (n, d), and gives their actions, (n, k), and of a class
+    there is one instance for all that begin together. A model's `predict` keeps the state of a
+    recurrent policy for each episode. Actions are clipped to the task's bounds.
+    """
+
+    kind: ClassVar[str] = "own"
+    name: str  # module:function and a digest of it
+    thing: Any = field(repr=False, compare=False)
+
+    @classmethod
+    def named(cls, code: str) -> "Own":
+        """What a name of code stands for, as in mymodule:act."""
+        return cls(with_digest(code, "policy"), code_named(code, "policy"))
+
+    @classmethod
+    def of(cls, thing: Any) -> "Own":
+        """A function, class or model itself."""
+        acting = getattr(thing, "policy", thing) if hasattr(thing, "predict") else thing
+        if not (callable(acting) or hasattr(acting, "predict")):
+            raise InputError(
+                f"the policy is {acting!r:.80}: it must be a name, a function of an observation, a "
+                "class of such, or a model of stable-baselines3"
+            )
+        kind = type(acting)
+        name = f"{kind.__module__}:{kind.__qualname__}"
+        if hasattr(acting, "__qualname__"):
+            name = f"{acting.__module__}:{acting.__qualname__}"
+        return cls(f"{name} {digest_of(acting)}", acting)
+
+    def files(self) -> dict[str, bytes]:
+        return {}
+
+    def settings(self) -> dict[str, Any]:
+        return {"kind": self.kind, "name": self.name}
+
+    def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
+        batched = getattr(self.thing, "batched", False)
+        with self._refusing():
+            acting = [_acting(self.thing) for _ in range(1 if batched else len(seeds))]
+        low, high = np.array(task.action_low), np.array(task.action_high)
+        shape = len(seeds), task.action_size
+
+        def act(observation: Array) -> NDArray[Any]:
+            seen = observation.astype(np.float32)
+            with self._refusing():
+                rows = zip(acting, seen, strict=False)
+                made = acting[0](seen) if batched else [each(row) for each, row in rows]
+                actions = np.asarray(made, float)
+            if actions.shape == shape[:1] and shape[1] == 1:
+                actions = actions[:, None]
+            if actions.shape != shape or not np.isfinite(actions).all():
+                what, taken = ("actions", shape) if batched else ("an action", shape[1:])
+                given = actions.shape if batched else actions.shape[1:]
+                raise InputError(
+                    f"the policy {self.name} gives {what} of shape {given}: it must be {taken}, "
+                    "all finite"
+                )
+            return np.minimum(np.maximum(actions, low), high)
+
+        return act
+
+    def _refusing(self) -> AbstractContextManager[None]:
+        return refusing(f"the policy {self.name} fails")
+
+
+def _acting(thing: Any) -> Callable[[NDArray[np.float32]], Any]:
+    """The function that acts in an episode that begins now."""
+    made = thing() if isinstance(thing, type) else thing
+    if not hasattr(made, "predict"):
+        return made
+    state, first = None, True
+
+    def act(observation: NDArray[np.float32]) -> Any:
+        nonlocal state, first
+        action, state = made.predict(observation, state, np.array([first]), deterministic=True)
+        first = False
+        return action
+
+    return act
+
+
 POLICIES: dict[str, type[Uniform | Still | Heuristic | Constant | OrnsteinUhlenbeck]] = {
     policy.kind: policy for policy in (Uniform, Still, Heuristic, Constant, OrnsteinUhlenbeck)
 }
@@ -200,11 +288,13 @@ def parse_policy(text: str, other: Callable[[str], Policy | None] = lambda text:
         return policy
     if not _WEIGHT.search(text):
         kind, _, constants = text.partition(":")
+        if kind not in POLICIES and is_code(text):
+            return Own.named(text)
         if kind not in POLICIES:
             raise InputError(
                 f"unknown policy {kind!r}: choose one of {', '.join(POLICIES)}, trained, the "
-                "folder of a run with a policy or checkpoint, or a mixture, such as "
-                "uniform:0.8+heuristic:0.2"
+                "folder of a run with a policy or checkpoint, your own as module:function, or a "
+                "mixture, such as uniform:0.8+heuristic:0.2"
             )
         pairs = (pair.partition("=") for pair in constants.split(",") if pair)
         return _make(kind, {name.strip(): value for name, _, value in pairs})
@@ -238,6 +328,11 @@ def make_policy(
     """Make a policy from its settings, as in a manifest; those of runs need more than these."""
     if trained and settings["kind"] == TRAINED:
         return trained(settings)
+    if settings["kind"] == Own.kind:
+        own = Own.named(settings["name"].partition(" ")[0])
+        if own.settings() != settings:
+            raise InputError(f"the policy {settings['name']} has changed: it is {own.name} now")
+        return own
     if settings["kind"] == MIXTURE:
         return Mixture(tuple((w, make_policy(part, trained)) for w, part in settings["parts"]))
     constants = {name: value for name, value in settings.items() if name != "kind"}

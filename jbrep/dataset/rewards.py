@@ -1,14 +1,12 @@
 """Rewards of a user's own for data that exist already, by a function."""
 
-import hashlib
-import json
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.envs.names import code_named, code_of
+from jbrep.envs.names import code_named
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, refusing
 
@@ -39,12 +37,6 @@ def reward_function(code: str) -> Callable[[Array, Array], NDArray[np.float64]]:
         return given
 
     return rewards
-
-
-def with_hash(code: str) -> str:
-    """The name of such a function with the hash of its code, as data of two codes differ."""
-    parts = sorted(code_of(code_named(code, "reward")).items())
-    return f"{code} {hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]}"
 
 
 def without_range(task: Task) -> Task:

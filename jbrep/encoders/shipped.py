@@ -46,15 +46,6 @@ def unlearned(task: Task, name: str = FULL) -> Encoder:
     return _scaled(task, name, tried_coordinates(task, UNLEARNED[name]))
 
 
-def unscaled(task: Task) -> Encoder:
-    """A task's observation as it is, in physical units."""
-    header = EncoderHeader(
-        kind=FULL, name="observation", environment=task, metrics={HELD_OUT_MSE: 0.0}
-    )
-    high = np.ones(task.size, np.float32)
-    return Encoder(header, Scaler(-high, high), (), ())
-
-
 def _scaled(task: Task, name: str, coordinates: Coordinates | None) -> Encoder:
     features = coordinates.features if coordinates else task.features
     ranges = [usual_range(feature) for feature in features]

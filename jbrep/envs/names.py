@@ -2,6 +2,7 @@
 
 import difflib
 import hashlib
+import json
 import os
 import re
 import shlex
@@ -188,6 +189,32 @@ def files_of(arguments: Mapping[str, Any]) -> dict[str, str]:
 def code_of(maker: Any) -> dict[str, str]:
     """SHA-256 of the user's file that defines a class or function, by the name of its module."""
     name = getattr(getattr(maker, "func", maker), "__module__", "")  # of a partial function, too
+    return _module_code(name)
+
+
+def with_digest(code: str, what: str) -> str:
+    """A name of code, as in mymodule:act, with a digest of the user's files that define it."""
+    files = _module_code(code.partition(":")[0]) | code_of(code_named(code, what))
+    return f"{code} {_short(json.dumps(sorted(files.items())).encode())}"
+
+
+def digest_of(thing: Any) -> str:
+    """The same digest of a Python object: of its code, what it holds, or its weights."""
+    import cloudpickle
+
+    if hasattr(thing, "state_dict"):  # torch pickles addresses, too
+        content = b"".join(each.numpy(force=True).tobytes() for each in thing.state_dict().values())
+    else:
+        with refusing("the policy can't be told from others: give it as module:function"):
+            content = cloudpickle.dumps(thing)
+    return _short(content + json.dumps(sorted(code_of(thing).items())).encode())
+
+
+def _short(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:12]
+
+
+def _module_code(name: str) -> dict[str, str]:
     file = getattr(sys.modules.get(name), "__file__", None)
     path = Path(file).resolve() if file and name != "__main__" else None
     if path is None or not path.is_file() or any(each in path.parents for each in _INSTALLED):

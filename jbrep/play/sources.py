@@ -1,4 +1,4 @@
-"""What a user names: an episode of a data set, or a policy of a run, in a file, or by its name."""
+"""What a user names: an episode of a data set, or a policy, of a run, a file or their own."""
 
 import hashlib
 from collections.abc import Callable, Mapping
@@ -9,10 +9,11 @@ import msgspec
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from jbrep.collecting.policies import POLICIES, Policy, make_policy, parse_policy
+from jbrep.collecting.policies import POLICIES, Own, Policy, make_policy, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import FULL
+from jbrep.envs.names import is_code
 from jbrep.envs.recording import Actor, held
 from jbrep.envs.task import Array, Task, check_same
 from jbrep.errors import DamageError, InputError, first_line, refusing
@@ -50,13 +51,16 @@ def find_episode(
     return find_player(source, task, encoder).play_one(episode)
 
 
-def find_policy(text: str, folder: Path, task: Task) -> Policy:
-    """The policy that a text names, to collect with in the folder of a data set.
+def find_policy(given: Any, folder: Path, task: Task) -> Policy:
+    """The policy to collect with in the folder of a data set.
 
-    It is the folder of a run or the file of a policy, a name such as constant:drive=0.5, or a
-    mixture such as uniform:0.5+runs/a:0.5. The policy of a run is frozen: it is the one that the
-    data set has already, or else the run's last.
+    It is named by the folder of a run, the file of a policy, a name such as constant:drive=0.5,
+    code, mymodule:act, or a mixture such as uniform:0.5+runs/a:0.5; or it is a user's own object,
+    as `Own` takes it. The policy of a run is frozen: it is the one that the data set has already,
+    or else the run's last.
     """
+    if not isinstance(given, (str, Path)):
+        return Own.of(given)
     taken: list[str] = []
 
     def frozen(part: str) -> Policy | None:
@@ -73,7 +77,7 @@ def find_policy(text: str, folder: Path, task: Task) -> Policy:
         taken.extend([file] if found else [])
         return found
 
-    return parse_policy(text, frozen)
+    return parse_policy(str(given), frozen)
 
 
 def kept_policy(folder: Path) -> Callable[[Mapping[str, Any]], Policy]:
@@ -93,18 +97,19 @@ def is_trained(source: str) -> bool:
 
 
 def is_by_name(source: str) -> bool:
-    """Whether a source is a policy by its name, which needs a task."""
-    return source == SHIPPED or source.partition(":")[0] in POLICIES
+    """Whether a source is a policy by its name or code, which needs a task."""
+    return source == SHIPPED or source.partition(":")[0] in POLICIES or is_code(source)
 
 
 def check_source(source: str) -> None:
     """Make sure that a source is something to play or replay, without loading it."""
-    if is_trained(source) or is_by_name(source) or exists(Path(source) / MANIFEST):
+    known = is_trained(source) or is_by_name(source) or is_exported(source)
+    if known or exists(Path(source) / MANIFEST):
         return
     check_begun(Path(source))
     raise InputError(
-        f"{source} is no data set, no run with a policy or checkpoint, and no policy by name: "
-        f"those are {policy_names()}"
+        f"{source} is no data set, no run with a policy or checkpoint, no exported policy, and no "
+        f"policy by name: those are {policy_names()}, and your own as module:function"
     )
 
 
@@ -118,20 +123,28 @@ def policy_file(source: str, task: Task | None) -> Path:
     return find_shipped(_needed(task, source)) if source == SHIPPED else Path(source)
 
 
-def find_player(source: str, task: Task | None = None, encoder: Any = None) -> Player:
-    """The policy of a run, or one by its name, such as heuristic or constant:drive=0.5.
+def find_player(source: Any, task: Task | None = None, encoder: Any = None) -> Player:
+    """The policy of a run, in a file, by its name, or a user's own.
 
     Args:
-        source: the run's folder, or a policy in it, a policy's file, or the name; trained is
-            the one that ships for the task. A run that is not over plays its last checkpoint.
-        task: for a policy by its name. A run has its own; if one is given, it must be of the same
-            environment, and is played instead: with other arguments or another time limit.
-        encoder: the object that a run was made with, if its encoder is a user's own.
+        source: the folder of a run, or a policy in it, which plays its last checkpoint if it is not
+            over; the file of a policy, also an exported one; a name, such as constant:drive=0.5, or
+            trained, which ships for the task; or what `Own` takes, or its code, mymodule:act.
+        task: for a policy by its name or a user's own. Others have their own; if one is given, it
+            must be of the same environment, and is played instead: with other arguments or another
+            time limit.
+        encoder: the one that a run was made with, if that is a user's own.
     """
+    if not isinstance(source, (str, Path)):
+        own = Own.of(source)
+        return Player(own.name, _needed(task, own.name), own.begin)
+    source = str(source)
     if is_trained(source):
         return _trained(source, task, encoder)
     if exists(Path(source) / MANIFEST):
         raise InputError(f"{source} is a data set: give the folder of a run or a policy")
+    if is_exported(source):
+        return _exported(Path(source), task)
     check_source(source)
     return Player(source, _needed(task, source), parse_policy(source).begin)
 
@@ -142,9 +155,7 @@ def _needed(task: Task | None, policy: str) -> Task:
     return task
 
 
-def find_good_policy(
-    source: str | None, task: Task, own_rewards: bool = False
-) -> "GoodPolicy | None":
+def find_good_policy(source: Any, task: Task, own_rewards: bool = False) -> "GoodPolicy | None":
     """A policy with the episodes that it plays: the first of those that runs are evaluated on.
 
     Without a source it is the hand-written policy, if the task has one. Nothing is played where
@@ -154,7 +165,7 @@ def find_good_policy(
         if own_rewards or jitterbug_task(task) is None:
             return None
         source = _HEURISTIC
-    known = POLICIES.get(source.partition(":")[0])
+    known = POLICIES.get(str(source).partition(":")[0])
     if known is not None and known.open_loop:
         raise InputError(
             f"policy {source} doesn't act on what it observes: give {_HEURISTIC} or a run's folder"
@@ -168,7 +179,7 @@ def find_good_policy(
 
     played = [] if own_rewards else player.play(range(_GOOD_EPISODES))
     episodes = [PlayedEpisode(each.observation, each.reward, each.terminated) for each in played]
-    return GoodPolicy(source, act, episodes)
+    return GoodPolicy(player.name, act, episodes)
 
 
 def run_folder(source: str) -> Path | None:
@@ -186,6 +197,8 @@ def _trained(source: str, task: Task | None, encoder: Any) -> Player:
     from jbrep.rl.policy_file import read
 
     folder = run_folder(source)
+    if encoder is not None and folder is None:
+        raise InputError(f"{source} has its own encoder: leave out the encoder")
     trained = load_run(folder, encoder) if folder else of_file(read(policy_file(source, task)))
     name = str(folder or source)
     _check_task(name, trained.task, task)
@@ -245,7 +258,12 @@ def read_exported(path: Path) -> tuple[Any, Described]:
     return made, told
 
 
-def exported_player(path: Path, task: Task | None = None) -> Player:
+def is_exported(source: str) -> bool:
+    """Whether a source is the file of an exported policy."""
+    return source.endswith(".onnx") and exists(Path(source))
+
+
+def _exported(path: Path, task: Task | None) -> Player:
     """The policy in a file, to play its own task, maybe with another body or time limit."""
     session, said = read_exported(path)
     known = task or said.environment

@@ -239,7 +239,6 @@ def deterministic_actor(
     """
     policy.set_training_mode(False)
     low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
-    is_scaled = is_action_scaled(policy.action_space)
 
     def act(observation: Array) -> NDArray[np.float32]:
         size = batch_size or len(observation)
@@ -251,16 +250,9 @@ def deterministic_actor(
             ]
         actions = torch.cat(chosen).numpy(force=True)
         own = policy.unscale_action(actions) if policy.squash_output else actions
-        return np.clip(task.unscale_action(own).astype(np.float32) if is_scaled else own, low, high)
+        return np.clip(task.unscale_action(own).astype(np.float32), low, high)
 
     return act
-
-
-def is_action_scaled(space: gymnasium.Space[Any]) -> bool:
-    """Whether actions in a space are scaled to [-1, 1]."""
-    if not isinstance(space, spaces.Box):
-        return False
-    return bool((space.low == -1).all() and (space.high == 1).all())
 
 
 def preprocessor(encode: Preprocess, statistics: Statistics | None) -> Preprocess:

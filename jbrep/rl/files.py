@@ -20,7 +20,7 @@ from jbrep.rl.settings import MAX_STEPS, Line, Name
 POLICY_SUFFIX = ".safetensors"
 RUN = "run.json"  # written last: its presence means that the run has ended
 POLICY = "policy.safetensors"
-POLICY_ZIP = "policy.zip"  # the same for stable-baselines3; jbrep reads it elsewhere only
+POLICY_ZIP = "policy.zip"  # the same for stable-baselines3
 CHECKPOINT = "checkpoint.safetensors"  # of a study's run, until it ends
 SOON = "which a run writes about a minute after its start"  # of either, for messages
 BEGINNING = "beginning.safetensors"  # the policy that it begins with, if that is another run's

@@ -60,7 +60,7 @@ class Trained(NamedTuple):
     policy: BasePolicy
     task: Task
     encoder: BaseEncoder
-    settings: RunSettings | None = None  # none of a file from elsewhere
+    settings: RunSettings
     step: int | None = None  # of training, if it is not over
     statistics: Statistics | None = None  # by which it normalises what it sees, if it does
     action_repeat: int = 1  # control steps for which each of its actions is held
@@ -68,12 +68,12 @@ class Trained(NamedTuple):
     @property
     def representation(self) -> str:
         """What the policy observes, as tables call it."""
-        return self.settings.representation if self.settings else str(self.encoder.name)
+        return self.settings.representation
 
     @property
     def evaluation_episodes(self) -> int:
         """That the run's evaluations play at once."""
-        return self.settings.evaluation_episodes if self.settings else 1
+        return self.settings.evaluation_episodes
 
     def begin(self, task: Task, seeds: Any) -> Actor:
         """Act deterministically in episodes that begin now; nothing is drawn.
@@ -156,7 +156,6 @@ def pack(trained: Trained, run: str) -> bytes:
 
 def pack_whole(trained: Trained) -> bytes:
     """The bytes of the policy's file in a run's folder, with all that a run can begin with."""
-    assert trained.settings is not None
     weights, acts = trained.policy.state_dict(), acting_prefix(trained.policy)
     others = {name: each for name, each in weights.items() if not name.startswith(acts)}
     return _pack(trained, trained.settings.name, _named(TRAINING, others))
@@ -164,7 +163,6 @@ def pack_whole(trained: Trained) -> bytes:
 
 def _pack(trained: Trained, run: str, tensors: Tensors) -> bytes:
     settings, encoder = trained.settings, trained.encoder
-    assert settings is not None
     header = PolicyHeader(
         settings=settings,
         encoder=encoder.header.as_json() if isinstance(encoder, Encoder) else None,

@@ -348,7 +348,7 @@ def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | 
         tables |= _write_tables(folder, history)
         if policy:
             write_whole(folder / POLICY, policy)
-            write_whole(folder / POLICY_ZIP, policy_zip(agent, settings))
+            write_whole(folder / POLICY_ZIP, policy_zip(agent))
     steps = settings.control_steps(agent.num_timesteps)
     record = RunRecord(
         status=FAILED if failed else FINISHED,

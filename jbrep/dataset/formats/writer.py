@@ -26,11 +26,11 @@ from jbrep.dataset.manifest import (
     write_manifest,
 )
 from jbrep.dataset.reader import Dataset
-from jbrep.dataset.rewards import reward_function, with_hash, without_range
+from jbrep.dataset.rewards import reward_function, without_range
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
 from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
 from jbrep.envs.description import as_task, with_features
-from jbrep.envs.names import is_code
+from jbrep.envs.names import is_code, with_digest
 from jbrep.envs.probe import Signals, precision_problems
 from jbrep.envs.task import Missing, Task
 from jbrep.errors import InputError, Notice, kind_and_line
@@ -289,7 +289,7 @@ def _settings(source: Source, survey: _Survey, task: Task, reward: str) -> DataS
         task=task,
         policy={"kind": IMPORTED, "source": printable(source.name)[-MAX_LETTERS:]},
         unrewarded=UNSET if source.has_rewards or reward else True,
-        reward=with_hash(reward) if reward else UNSET,
+        reward=with_digest(reward, "reward") if reward else UNSET,
         steps=steps,
         shard_episodes=max(1, rows * len(survey.lengths) // steps),
     )
