@@ -239,7 +239,6 @@ given = (
     "rl --task face_direction --encoder fly --out x", "rl --task face_direction --seed -1 --out x",
     "rl --task face_direction --preset fly --out x", "rl --task face_direction --set a --out x",
     "rl --task face_direction --from nothing --out x",
-    "tune --task face_direction --steps 0 --out x",
     "train-encoder --kind fly --data nothing --out x",
     "collect --task fly --steps 10 --out x", "collect --task face_direction --steps -5 --out x",
     "evaluate --encoder dae-8 --data nothing",

@@ -19,7 +19,6 @@ LESS = {  # by command: numbers in place of a page's, or beside them
     "train-dae": {"--epochs": "2"},
     "train-encoder": {},
     "rl": {"--steps": "200", "--evaluation-episodes": "1", "--episode-steps": "100"},
-    "tune": {"--steps": "1100", "--trials": "1", "--evaluation-episodes": "1"},
     "render": {"--seconds": "0.5", "--size": "64x64"},
     "evaluate-policy": {"--episodes": "2"},
 }
@@ -82,7 +81,7 @@ def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
     finally:
         sys.modules.pop("my_package", None)
         gymnasium.registry.pop("MyRobot-v0", None)
-    for made in ("ddpg.onnx", "walk.mp4", "runs/study/report.html", "runs/tune/best.toml"):
+    for made in ("ddpg.onnx", "walk.mp4", "runs/study/report.html"):
         assert (tmp_path / made).stat().st_size, made
 
 

@@ -14,11 +14,12 @@ from jbrep.envs import describe
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import episode_returns
 from jbrep.errors import InputError
+from jbrep.records.document import toml_text
 from jbrep.reporting.tables import read_tables
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.agent import evaluate, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, read_evaluations, read_run
-from jbrep.rl.learner import Learner, preset_text, read_preset, usual_name
+from jbrep.rl.learner import Learner, read_preset, usual_name
 from jbrep.rl.overrides import overridden
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.presets import sb3_class
@@ -121,7 +122,8 @@ def test_the_command_line_sets_them(tmp_path):
 
 def preset(algorithm, overrides):
     """A preset file."""
-    return preset_text(Learner.given(algorithm, "modern", overrides))
+    learner = Learner.given(algorithm, "modern", overrides)
+    return toml_text({algorithm: {"base": learner.preset, **learner.overrides}})
 
 
 def test_a_preset_file(tmp_path):

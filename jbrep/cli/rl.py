@@ -1,20 +1,16 @@
-"""Training one agent, and a search for an algorithm's settings."""
+"""Training one agent."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
-
-from msgspec import Meta
 
 from jbrep import api
 from jbrep.cli.base import RESUMES, command, say, tell
 from jbrep.cli.signals import stop_signals, stoppable
 from jbrep.errors import StoppedError
-from jbrep.parameters import NOTHING, Algorithm, DrawnTask, Normalize, Overrides, Preset, Seen
-from jbrep.rl.settings import Episodes, Seed
-from jbrep.rl.settings import Steps as TrainingSteps
-from jbrep.text import returns_text, rounded
+from jbrep.parameters import DrawnTask
+from jbrep.text import returns_text
 
 _BESIDE = 10  # episodes of policies that don't learn
 
@@ -51,68 +47,6 @@ def _rl(
     return False
 
 
-@command(
-    "tune --task face_direction --algorithm sac --preset modern --trials 20 --steps 20k "
-    "--out runs/tune"
-)
-def tune(
-    task: DrawnTask,
-    out: Path,
-    *,
-    algorithm: Algorithm = "sac",
-    preset: Preset = "",
-    encoder: Seen = "full",
-    overrides: Overrides = NOTHING,
-    normalize: Normalize = False,
-    trials: Annotated[int, Meta(ge=1)] = 20,
-    seeds: Annotated[int, Meta(ge=1)] = 1,
-    seed: Seed = 0,
-    steps: TrainingSteps = 100_000,
-    evaluation_episodes: Episodes = 10,
-) -> None:
-    """Search for an algorithm's settings with Optuna.
-
-    Learning rate, batch size, discount, layers and others of the algorithm are searched, but for
-    those that --set gives. The score of a trial is the mean return of its runs' last evaluations.
-    The best settings are written as a preset file, for `preset`. The same command resumes a search;
-    `trials` may grow.
-
-    Args:
-        out: a folder for this search.
-        trials: how many in all.
-        seeds: runs of each trial.
-        seed: of the search and runs.
-        steps: of each run.
-        evaluation_episodes: of a run's evaluation.
-    """
-    with stop_signals() as received:
-        known = api.check_learner(task, algorithm, preset, encoder)
-        from jbrep.rl import Run  # imports torch, after all words are known
-        from jbrep.rl.tune import BEST, Trial
-        from jbrep.rl.tune import tune as search
-
-        def show(trial: Trial) -> None:
-            score = "failed" if trial.value is None else rounded(trial.value)[0]
-            say(f"trial {trial.number + 1} of {trials}: {score}  {_shown(trial.overrides)}")
-
-        run = Run.of(
-            known,
-            algorithm,
-            preset,
-            {**overrides, "normalize": True} if normalize else overrides,
-            encoder=encoder,
-            seed=seed,
-            steps=steps,
-            evaluate_every=steps,
-            evaluation_episodes=evaluation_episodes,
-            final_episodes=evaluation_episodes,
-        )
-        with _told_when_stopped(received, f" of a trial; {RESUMES}"):
-            best = search(run, trials, seeds, out, show, stop=lambda: bool(received))
-    say(f"\nbest: trial {best.number + 1}, {_shown(best.overrides)}")
-    say(f"as a preset, for --preset: {out / BEST}")
-
-
 @contextmanager
 def _told_when_stopped(received: list[int], more: str) -> Iterator[None]:
     """End the command once a signal has stopped what it trains, as a shell reports it."""
@@ -121,8 +55,3 @@ def _told_when_stopped(received: list[int], more: str) -> Iterator[None]:
     except StoppedError as error:
         say(f"{error}{more}", err=True)
         raise SystemExit(128 + received[0]) from None
-
-
-def _shown(overrides: Mapping[str, Any]) -> str:
-    values = ((n, f"{v:.3g}" if isinstance(v, float) else str(v)) for n, v in overrides.items())
-    return ", ".join(f"{name} {value}" for name, value in values)

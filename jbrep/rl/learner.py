@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jbrep.errors import InputError
-from jbrep.records.document import read_toml, toml_text
+from jbrep.records.document import read_toml
 from jbrep.records.record import Record
 from jbrep.rl.overrides import overridden
 from jbrep.rl.presets import ALGORITHMS, PAPER, PRESETS, Hyperparameters, base_name, get_preset
@@ -164,8 +164,3 @@ def read_preset(path: Path, algorithm: str) -> tuple[str, dict[str, Any]]:
     except InputError as error:
         raise InputError(f"{path}, [{algorithm}]: {error}") from None
     return base, overrides
-
-
-def preset_text(learner: Learner) -> str:
-    """The text of a preset file with a learner's preset and overrides."""
-    return toml_text({learner.algorithm: {"base": learner.preset, **learner.overrides}})

@@ -25,7 +25,6 @@ from jbrep.reporting.tables import read_tables
 from jbrep.rl import Run, Session, train
 from jbrep.rl.checkpoint import Checkpoint
 from jbrep.rl.files import CHECKPOINT, ENCODER, EVALUATIONS, POLICY, RUN
-from jbrep.rl.tune import BEST, SEARCH
 from jbrep.studies.config import Study
 from jbrep.studies.plan import REGISTRATION, Plan, find_committed, registration_in
 from jbrep.studies.record import RECORD
@@ -98,26 +97,6 @@ CHEAP = {"net_arch": [8], "learning_starts": 8, "batch_size": 8, "buffer_size": 
 def _study(folder):
     run_study(Plan(TINY, folder), in_this_process, 1)
     make_report(folder)
-
-
-def _tune():
-    given = ("--algorithm", "a2c", "--trials", 3, "--set", "net_arch=[4]")
-
-    def act(folder):
-        command("tune", *SHORT, *given, "--out", folder / "it")
-
-    def result(folder):
-        runs = sorted(folder.rglob(EVALUATIONS))
-        return digest(folder / "it" / BEST), [digest(path) for path in runs]
-
-    def read(folder):
-        command_or_refusal("tune", *SHORT, *given, "--out", folder / "it")
-        return result(folder)
-
-    def files(folder):
-        return [folder / "it" / SEARCH, *folder.rglob(RUN), *folder.rglob(EVALUATIONS)]
-
-    return Surface(act, result, files, read)
 
 
 def command_or_refusal(*arguments):
@@ -301,7 +280,6 @@ SHORT_RUN = (
     "--evaluation-episodes 1 --from run --out it"
 )
 SURFACES = {  # by name, what makes them of `Shared`
-    "tune": lambda shared: _tune(),
     "checkpoints of sac": lambda shared: _run("sac", overrides=CHEAP),
     "checkpoints of ppo": lambda shared: _run(
         "ppo", overrides={**SMALL, "n_steps": 8, "batch_size": 8}
