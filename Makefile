@@ -17,7 +17,7 @@ help: ## what there is to make
 
 setup: $(READY) ## a virtual environment with everything in it
 $(READY): $(READY_DEMO)
-	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[cluster,dm-control,export,learn,logs,render,suite,view,wandb,dev]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[cluster,dm-control,export,learn,logs,render,suite,view,dev]'
 	@touch $@
 
 $(READY_DEMO): pyproject.toml constraints.txt

@@ -309,7 +309,6 @@ def train(
     threads: Annotated[int, Meta(ge=1, le=4096)] | None = None,
     retries: Retries = 0,
     begin_from: Annotated[str, Meta(extra={"option": "from", "metavar": "RUN"})] = "",
-    wandb: Annotated[str | None, Meta(extra={"metavar": "PROJECT"})] = None,
     stop: Callable[[], bool] = lambda: False,
     **settings: Annotated[Any, TrainingSettings],
 ) -> Agent:
@@ -329,7 +328,6 @@ def train(
             and evaluations wait for the end of an episode.
         begin_from: begin with the final weights of a finished run of the same algorithm and sizes,
             such as one on another body; optimisers and SAC's entropy coefficient start anew.
-        wandb: log to a project of Weights & Biases, too; WANDB_MODE=offline keeps it in the folder.
         stop: asked before each rollout; once it is true, the run writes a checkpoint and stops.
         settings: of the training: steps, evaluate_every, evaluation_episodes, ...
 
@@ -359,16 +357,10 @@ def train(
         _note(f"the run in {folder} had {now.ended.status} already: nothing was done")
     else:
         _note_limits(now.settings)
-    writers = []
-    if wandb:
-        from jbrep.rl.history import Tracker
-
-        writers.append(Tracker(wandb, folder, now.settings))
     with closing(Bar(run.steps, f"{algorithm} on {found.name}")) as bar:
         session = Session(
             bar.show,
             stop=stop,
-            writers=writers,
             keep_checkpoint=True,
             threads=threads or cores(),
             retries=retries,

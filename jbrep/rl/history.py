@@ -1,13 +1,9 @@
 """What a run has recorded so far, and where it is shown: on a terminal, and in logs."""
 
-import hashlib
-import json
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +12,14 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.envs.recording import Outcome
-from jbrep.errors import first_line
 from jbrep.progress import Progress
 from jbrep.records import tables
-from jbrep.records.record import to_plain
 from jbrep.rl.files import Episode, Evaluation, Info
 from jbrep.rl.run_settings import RunSettings
 from jbrep.text import rounded
 
 _LINE = "{desc}: {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"  # on a terminal
 _NAME = 16  # letters in it, at most
-_TENSORBOARD = "tensorboard"  # what is kept from it is kept from Weights & Biases, too
 
 
 @dataclass
@@ -106,10 +99,10 @@ class Bar:
 
 
 class ControlStepsLogger(Logger):
-    """stable-baselines3's logger, that tells writers control steps instead of its agent's."""
+    """stable-baselines3's logger, with control steps instead of its agent's, for TensorBoard."""
 
-    def __init__(self, settings: RunSettings, writers: list[KVWriter]):
-        super().__init__(None, writers)
+    def __init__(self, settings: RunSettings, scalars: KVWriter):
+        super().__init__(None, [scalars])
         self._settings = settings
 
     def dump(self, step: int = 0) -> None:
@@ -122,61 +115,3 @@ class Scalars(TensorBoardOutputFormat):
     def __init__(self, folder: Path, step: int):
         self.writer = SummaryWriter(str(folder), purge_step=step + 1)
         self._is_closed = False
-
-
-class Tracker(KVWriter):
-    """Logs to Weights & Biases what TensorBoard gets, from the first record on.
-
-    Whatever goes wrong there is said once, in a line, and the run goes on. The environment's
-    WANDB_MODE decides whether it is online, offline or disabled.
-
-    Args:
-        project: of Weights & Biases.
-        folder: of the run; its name is the run's there, and files are kept in it.
-        settings: of the run.
-    """
-
-    def __init__(self, project: str, folder: Path, settings: RunSettings):
-        import wandb  # an extra: where it is missing, that is known before training
-
-        self._project, self._folder, self._settings = project, folder, to_plain(settings)
-        self._wandb: Any = wandb
-        self._run: Any = None
-        self._failed = False
-
-    def write(
-        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
-    ) -> None:
-        numbers = {
-            name: float(value)
-            for name, value in key_values.items()
-            if isinstance(value, Real) and _TENSORBOARD not in (key_excluded[name] or ())
-        }
-        if self._failed:
-            return
-        try:
-            self._run = self._run or self._begin()
-            self._run.log({**numbers, "step": step})
-        except Exception as error:  # of its many kinds none may end a run
-            self._failed = True
-            reason = first_line(error)
-            print(f"Weights & Biases: {reason}; the run goes on without it", file=sys.stderr)
-
-    def close(self) -> None:
-        if self._run and not self._failed:
-            try:
-                self._run.finish()
-            except Exception:  # the run's own files are complete
-                self._failed = True
-
-    def _begin(self) -> Any:
-        text = json.dumps([self._project, str(self._folder), self._settings], sort_keys=True)
-        return self._wandb.init(
-            project=self._project,
-            name=self._folder.name,
-            id=hashlib.sha256(text.encode()).hexdigest()[:16],  # that a resumed run finds again
-            resume="allow",
-            config=self._settings,
-            dir=str(self._folder),
-            settings=self._wandb.Settings(silent=True, console="off"),
-        )

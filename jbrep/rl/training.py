@@ -1,7 +1,7 @@
 """One run in its folder: trained by stable-baselines3, from its start or from its checkpoint."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter
 
 from jbrep.encoders import Encoder, save
 from jbrep.encoders.base import BaseEncoder
@@ -88,7 +87,6 @@ class Session(NamedTuple):
     # asked before each rollout; once it is true, a checkpoint is written and training ends
     stop: Callable[[], bool] = lambda: False
     # of stable-baselines3's logger, that get what TensorBoard gets
-    writers: Sequence[KVWriter] = ()
     # whether a run that has ended keeps a checkpoint, from which it can go on
     keep_checkpoint: bool = False
     threads: int = 1  # that step environments
@@ -161,7 +159,7 @@ def _train(job: _Job, resumes: bool) -> RunRecord:
         if job.settings.begin_from:
             _begin(agent, job, is_new=not resumes)
         scalars = Scalars(job.folder / "tensorboard", history.first_step)
-        agent.set_logger(ControlStepsLogger(job.settings, [scalars, *job.session.writers]))
+        agent.set_logger(ControlStepsLogger(job.settings, scalars))
         with closing(_Progress(job, history, checkpoint)) as progress:
             failed = _learn(agent, job.settings.agent_steps, progress)
         return _end(agent, job, history, failed)
