@@ -112,7 +112,7 @@ MISTAKES = {
     "train-dae --data none --latent 8 --out x": "no data set in none",
     "data derive none --task fly --out x": "no data set in none",
     "data fly": "No such command 'fly'. See jbrep data --help.",
-    "evaluate-policy none": "no policy at none: a folder of jbrep rl is needed",
+    "evaluate-policy none": "none is no data set, no run",
     "collect --task face_direction --steps 1 --policy sprint --out x": "unknown policy 'sprint'",
     "train-dae --data none --out x": "dae needs --latent, such as --latent 12 8 4",
     "train-encoder --kind pca --data x --latent 8 --seed 1 --out x": "pca takes no --seed: leave i",

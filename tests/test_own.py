@@ -254,7 +254,7 @@ def test_a_run_on_code_is_played_once_its_module_may_run(trained, monkeypatch):
     monkeypatch.setattr("jbrep.envs.names._imported", [])
     assert "importing test_own runs it; if you trust it, add --import test_own" in mistake(*played)
     told = mistake(*played, "--encoder", "test_own:Whole")
-    assert "which has its own encoder: leave out --encoder" in told
+    assert "Whole is not the encoder that the run" in told
     told = jbrep(*played, "--encoder", "test_own:Half")
     assert "encoder: test_own:Half, code\nPendulum-v1 on Half: median return" in told.output
     monkeypatch.setattr("jbrep.envs.names._imported", [])

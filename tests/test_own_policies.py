@@ -105,6 +105,7 @@ def test_only_the_same_code_continues_a_data_set(tmp_path, monkeypatch):
     """Whether the code is in a module, which may change, or an object."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
     source = "def act(observation):\n    return [observation[0]]\n"
     (tmp_path / "swinging.py").write_text(source)
     collect = ("collect", "--policy", "swinging:act", "--out", "data", *OPTIONS, "--steps")

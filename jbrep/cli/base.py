@@ -28,7 +28,7 @@ _ORDER = (  # of work
 _GROUPS = {
     "data": "Inspect, repair, derive, import and export data sets.",
     "encoder": "Look at encoders, export and import them.",
-    "policy": "Export a trained policy for a robot, and check the file.",
+    "policy": "Export a trained policy for a robot.",
 }
 
 

@@ -20,7 +20,6 @@ from jbrep.parameters import (
     described,
 )
 from jbrep.records.record import to_plain
-from jbrep.rl.policy_file import SHIPPED
 from jbrep.text import counted, interval_of, percentiles, table, terminal_width
 
 if TYPE_CHECKING:
@@ -76,6 +75,7 @@ def export(
     from jbrep.play.sources import policy_file
     from jbrep.rl.controller import described, load_policy
     from jbrep.rl.controller import export as write
+    from jbrep.rl.policy_file import SHIPPED
 
     if task and policy != SHIPPED:
         raise InputError(
@@ -266,6 +266,7 @@ def _find(policy: str, encoder: str | None, options: dict[str, Any]) -> "Player"
     from jbrep.encoders import find
     from jbrep.envs.names import is_code
     from jbrep.play import sources
+    from jbrep.rl.policy_file import SHIPPED
 
     by_name = sources.is_by_name(policy)
     if by_name and not is_code(policy):
