@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import suppress
-from multiprocessing import Pipe
+from multiprocessing import Pipe, get_all_start_methods, set_start_method
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
@@ -143,7 +143,8 @@ def _end(idle: Iterable[_Worker], busy: Mapping[Future[Any], _Worker]) -> None:
 
 
 def _begin(connection: Connection) -> None:
-    """Begin a process."""
+    """Begin a process, in which an environment may start others as usual, not by loky."""
+    set_start_method(get_all_start_methods()[0], force=True)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which then asks
     signal.signal(signal.SIGTERM, lambda number, frame: None)  # likewise
     threading.Thread(target=_listen, args=(connection,), daemon=True).start()

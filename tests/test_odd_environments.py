@@ -8,6 +8,7 @@ import sys
 import traceback
 
 import pytest
+from command import jbrep
 from odd import FAILS, HARMLESS
 
 from jbrep.cli import main
@@ -114,3 +115,10 @@ CASES = [  # each thing with one command and one moment; tools/odd.py tries all
 @pytest.mark.parametrize(("how", "command", "when"), CASES)
 def test_a_command_ends_in_what_was_asked_or_in_a_line(how, command, when, tmp_path):
     assert problem(command, how, when, tmp_path / "it") is None
+
+
+def test_a_worker_s_environment_may_have_processes_too(tmp_path):
+    task = ("--task", "odd:Odd-v0", "--env", "how=a simulator", "--env", "when=make")
+    sizes = ("--steps", 48, "--shard-episodes", 2, "--threads", 2)
+    told = jbrep("collect", *task, *sizes, "--out", tmp_path / "data")
+    assert told.exit_code == 0, told.output

@@ -203,10 +203,12 @@ def close_kept() -> None:
 
 @atexit.register
 def close_all() -> None:
-    """Close every environment, used or not."""
-    close_kept()
-    while _used:
-        _close(_used.popitem()[1].env)
+    """Close every environment, used or not; at the end it matters to nobody whether one fails."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        close_kept()
+        while _used:
+            _close(_used.popitem()[1].env)
 
 
 def _close(env: Env) -> None:

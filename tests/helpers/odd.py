@@ -50,6 +50,15 @@ def _close(descriptor):
         os.close(descriptor)
 
 
+def _simulator():
+    """A process as multiprocessing starts it, which answers."""
+    ours, its = multiprocessing.Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=its.send, args=("ready",))
+    process.start()
+    assert ours.poll(20)
+    process.join()
+
+
 def _child():
     process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(0,))
     process.start()
@@ -76,6 +85,7 @@ HARMLESS = {  # it is played as if nothing had happened
     "Ctrl-C ignored": lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     "a thread": lambda: threading.Thread(target=time.sleep, args=(0.01,)).start(),
     "a child": _child,
+    "a simulator": _simulator,
     "garbage": gc.disable,
     "decimals": lambda: setattr(decimal.getcontext(), "prec", 2),
     "locale": lambda: locale.setlocale(locale.LC_ALL, "C"),
