@@ -32,6 +32,7 @@ from jbrep.parameters import (
     Seen,
     Threads,
     Workers,
+    find_study,
 )
 from jbrep.rl.settings import Seed, TrainingSettings
 
@@ -399,7 +400,7 @@ def study(
     """Train a grid of agents, and report what became of them.
 
     Args:
-        study: a `Study`, what its file would hold as a dictionary, or the file.
+        study: a `Study`, what its file would hold as a dictionary, the file, or demo, which ships.
         out: a folder; one that was stopped goes on. By default runs/NAME of the study's file.
     """
     from jbrep.studies import Plan, Study, read_study, run_study
@@ -408,8 +409,8 @@ def study(
     from jbrep.text import counted
 
     if isinstance(study, str | Path):
-        file, known = Path(study), read_study(Path(study))
-        plan = Plan(known, Path(out or Path("runs", file.stem)), file)
+        file = find_study(study)
+        plan = Plan(read_study(file), Path(out or Path("runs", file.stem)), file)
     elif out:
         plan = Plan(study if isinstance(study, Study) else as_study(study), Path(out), None)
     else:

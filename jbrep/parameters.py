@@ -165,3 +165,15 @@ GivenTask = Annotated["Task | str", Meta(extra={"made_by": described})]
 DrawnTask = Annotated["Task", Meta(extra={"made_by": drawn})]
 GivenDrawnTask = Annotated["Task | str", Meta(extra={"made_by": drawn})]
 OptionalTask = Annotated["Task | None", Meta(extra={"made_by": described})]
+
+
+def find_study(name: str | Path) -> Path:
+    """The file of a study: that path, or the one that ships under a name, such as demo."""
+    shipped = Path(__file__).parent / "studies" / "shipped"
+    ships = {each.stem: each for each in shipped.glob("*.toml")}
+    if os.path.isfile(name):  # noqa: PTH113, Path.is_file raises where a name is too long
+        return Path(name)
+    if str(name) not in ships:
+        choices = ", ".join(ships)
+        raise InputError(f"no study {name}: give a TOML file, or one that ships: {choices}")
+    return ships[str(name)]

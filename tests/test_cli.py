@@ -67,7 +67,7 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
     for arguments, message in (
         (("studies/none.toml",), "studies/none.toml"),
         (
-            ("studies/demo.toml", "--backend", "slurm"),
+            ("demo", "--backend", "slurm"),
             "unknown backend 'slurm': choose one of local, ray",
         ),
         (("README.md",), "README.md is not valid TOML"),
@@ -81,11 +81,10 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
 def test_folders_of_other_things_are_left_alone(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     short = ("--task", "face_direction", "--episode-steps", 10)
-    demo = Path(__file__).parent.parent / "studies/demo.toml"
     for command in (
         ("collect", *short, "--steps", 10),
         ("rl", *short, "--steps", 10),
-        ("study", demo),
+        ("study", "demo"),
         ("evaluate", "--encoder", "pca-4", "--data", "data/sample/face_direction"),
         ("report", "results/cart-pole"),
     ):

@@ -66,10 +66,10 @@ def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.environ.get("PYTHONPATH", ""))
     (tmp_path / "my_package.py").write_text(MY_ROBOT)
-    (tmp_path / "studies").mkdir()
-    demo = re.sub(r"^evaluations = .*\n", "", (ROOT / "studies/demo.toml").read_text(), flags=re.M)
+    file = ROOT / "jbrep/studies/shipped/demo.toml"
+    demo = re.sub(r"^evaluations = .*\n", "", file.read_text(), flags=re.M)
     (mine,) = re.findall(r"^```toml\n(.*?)^```", (ROOT / "README.md").read_text(), re.M | re.S)
-    for path, study in (("studies/demo.toml", demo), ("mine.toml", mine)):
+    for path, study in (("demo", demo), ("mine.toml", mine)):
         for key, value in STUDY.items():
             study = re.sub(rf"^{key} = .*\n", "", study, flags=re.M)
             study = f"{key} = {value}\n{study}"

@@ -9,7 +9,7 @@ from jbrep import api
 from jbrep.cli.base import RESUMES, command, say, say_json, tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError, choose
-from jbrep.parameters import AsJson, Backend, Workers
+from jbrep.parameters import AsJson, Backend, Workers, find_study
 from jbrep.text import Table, duration, terminal_width
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jbrep.studies.forecast import Forecast
 
 
-@command("study studies/demo.toml --out runs/demo")
+@command("study demo --out runs/demo")
 def study(
     study: Path,
     /,
@@ -32,7 +32,7 @@ def study(
 ) -> bool:
     """Train a grid of agents, and judge the claims of a study.
 
-    STUDY is a TOML file of tasks, algorithms, representations and seeds, such as those in studies/.
+    STUDY is a TOML file of tasks, algorithms, representations and seeds, or demo, which ships.
     Tasks are the Jitterbug's, by their names, and any environments, by their Gymnasium ids.
     One with claims is registered first, in a commit; then data sets and encoders are made. Stopped
     or killed, the same command resumes the study; runs that have ended are never run again.
@@ -49,6 +49,7 @@ def study(
         raise InputError("--dry-run and --register exclude each other: choose one")
     if register and (workers or backend != "local"):
         raise InputError("--register runs nothing: leave out --workers and --backend")
+    study = find_study(study)
     read_toml(study)
     from jbrep.studies.runner import BACKENDS  # imports torch
 
