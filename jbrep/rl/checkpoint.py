@@ -112,7 +112,7 @@ def run_settings(folder: Path) -> RunSettings:
 class Standing(NamedTuple):
     """How far a run has come in its folder."""
 
-    # of the run, with evaluations as far apart as before where the run leaves that open
+    # of the run, with the warm-up of before, and evaluations as far apart where that is left open
     settings: RunSettings
     # the contents of run.json, if the run has ended; it may have gone on from fewer steps
     ended: RunRecord | None = None
@@ -140,10 +140,11 @@ def standing(
     if latest is None:
         return Standing(wanted)
     before = record.settings if record else latest.settings
+    same = wanted.beginning_as(before)
     if is_open:
-        same = wanted.replace(evaluate_every=before.evaluate_every)
-        if before.is_extended_by(same) or not before.differing(same):
-            wanted = same
+        same = same.replace(evaluate_every=before.evaluate_every)
+    if before.is_extended_by(same) or not before.differing(same):
+        wanted = same
     if record and not record.settings.differing(wanted):
         return Standing(wanted, ended=record)
     is_longer = latest.settings.is_extended_by(wanted)

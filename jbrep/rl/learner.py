@@ -13,7 +13,14 @@ from jbrep.errors import InputError
 from jbrep.records.document import read_toml
 from jbrep.records.record import Record
 from jbrep.rl.overrides import overridden
-from jbrep.rl.presets import ALGORITHMS, PAPER, PRESETS, Hyperparameters, base_name, get_preset
+from jbrep.rl.presets import (
+    ALGORITHMS,
+    PRESETS,
+    Hyperparameters,
+    base_name,
+    get_preset,
+    usual_preset,
+)
 from jbrep.rl.settings import MAX_NAME, LearnerName
 from jbrep.text import slug
 
@@ -24,9 +31,7 @@ _MOST_LETTERS = 60  # of a name made from overrides
 class Learner(Record, frozen=True, kw_only=True):
     """An algorithm with its hyperparameters."""
 
-    # what tables call it: ddpg, with the preset paper; sac-modern, with another; or a name of the
-    # user's
-    name: LearnerName
+    name: LearnerName  # what tables call it: sac-wide, or a name of the user's
     algorithm: str  # a key of ALGORITHMS
     preset: str  # the base, one of PRESETS
     overrides: Mapping[str, Any] = {}  # what is set differently there
@@ -35,10 +40,11 @@ class Learner(Record, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, name: str) -> "Learner":
-        """The learner that is an algorithm with a preset."""
+        """The learner that is an algorithm with a preset, the usual one if it names none."""
         algorithm, _, preset = name.partition("-")
-        get_preset(preset or PAPER, algorithm)
-        return cls(name=name, algorithm=algorithm, preset=preset or PAPER)
+        preset = preset or usual_preset(algorithm)
+        get_preset(preset, algorithm)
+        return cls(name=base_name(algorithm, preset), algorithm=algorithm, preset=preset)
 
     @classmethod
     def given(
@@ -73,7 +79,7 @@ class Learner(Record, frozen=True, kw_only=True):
         if not isinstance(base, str) or not isinstance(preset, str):
             raise InputError("base and preset must be text")
         start = cls.of(base)
-        if preset and start.preset != PAPER:
+        if preset and base != start.algorithm:
             raise InputError(f"base is {base} and preset {preset}: only one may name a preset")
         learner = cls.given(start.algorithm, preset or start.preset, overrides, name)
         learner = learner.replace(draws=draws)
@@ -146,17 +152,17 @@ def _short(value: Any) -> str:
 def read_preset(path: Path, algorithm: str) -> tuple[str, dict[str, Any]]:
     """The base and the overrides of an algorithm in a preset file.
 
-    It is TOML, with a table for each algorithm: `base`, the preset that it begins with (paper by
-    default), and overrides.
+    It is TOML, with a table for each algorithm: `base`, the preset that it begins with (the usual
+    one by default), and overrides.
     """
-    get_preset(PAPER, algorithm)
+    usual = usual_preset(algorithm)
     tables = read_toml(path)
     if not isinstance(tables.get(algorithm), dict):
         raise InputError(
             f"{path} has no table [{algorithm}]: it has {', '.join(tables) or 'none at all'}"
         )
     overrides = tables[algorithm]
-    base = overrides.pop("base", PAPER)
+    base = overrides.pop("base", usual)
     try:
         if not isinstance(base, str):
             raise InputError(f"base is {base!r}: it must be one of {', '.join(PRESETS)}")

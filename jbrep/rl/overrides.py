@@ -109,6 +109,8 @@ def _overridden(algorithm: str, preset: str, text: str) -> Hyperparameters:
 def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> Hyperparameters:
     if name in (of_class := _parameters(algorithm)):
         checked = _typed(name, value, of_class[name])
+        if name == "learning_starts":
+            before = before.replace(warm_up=None)
         return before.replace(algorithm_kwargs={**before.algorithm_kwargs, name: checked})
     if name not in _OWN:
         checked = _of_policy(algorithm, name, value)

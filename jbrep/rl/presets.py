@@ -86,12 +86,26 @@ class Hyperparameters(Record, frozen=True):
         default_factory=lambda: {"activation_fn": "relu"}
     )
     normalize: bool = False  # whether the agent sees its input by the running mean and variance
+    # learning begins after this share of a run's steps, if learning_starts hasn't come before
+    warm_up: Annotated[float, Meta(gt=0, le=1)] | None = None
     # control steps for which each action is held, which are one step of the agent; what else counts
     # steps here counts the agent's
     action_repeat: Annotated[int, Meta(ge=1, le=MAX_REPEAT)] = 1
 
     def check(self) -> None:
         from_plain(self.optimizer_kwargs, _OfAdam, "optimizer_kwargs")
+
+    def within(self, control_steps: int) -> "Hyperparameters":
+        """The same in a run of so many steps, as its warm-up says."""
+        if self.warm_up is None:
+            return self
+        usual = self.algorithm_kwargs["learning_starts"]
+        return self.learning_from(min(usual, int(self.warm_up * self.agent_steps(control_steps))))
+
+    def learning_from(self, agent_step: int) -> "Hyperparameters":
+        """The same with another step from which the agent learns."""
+        changed = {**self.algorithm_kwargs, "learning_starts": agent_step}
+        return self.replace(algorithm_kwargs=changed)
 
     def agent_steps(self, control_steps: int) -> int:
         """The fewest steps of an agent that are so many control steps, or more."""
@@ -122,6 +136,7 @@ _MANY_ROBOTS = Hyperparameters(  # few gradient steps: one for 16 steps of a rob
         "batch_size": 512,
     },
     num_envs=64,
+    warm_up=0.0256,
     action_repeat=2,
 )
 _OF_ENTROPY = {  # the paper has SAC alone
@@ -234,8 +249,8 @@ ALGORITHMS = {
 
 
 def base_name(algorithm: str, preset: str) -> str:
-    """An algorithm with its preset, unless that is the paper's: ddpg, sac-modern."""
-    return algorithm if preset == PAPER else f"{algorithm}-{preset}"
+    """An algorithm with its preset: ddpg-paper, sac-wide."""
+    return f"{algorithm}-{preset}"
 
 
 def usual_preset(algorithm: str) -> str:

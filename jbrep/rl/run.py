@@ -85,7 +85,7 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
             preset=self.learner.preset,
             overrides=self.learner.overrides,
             learner=self.learner.name,
-            hyperparameters=self.learner.hyperparameters,
+            hyperparameters=self.learner.hyperparameters.within(self.steps),
             representation=self.representation or encoder.name,
             encoder=encoder.fingerprint,
             encoder_code=str(self.encoder) if is_kept_as_code else None,

@@ -84,6 +84,13 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
         """Whether `longer` differs in having more steps alone, so that it may go on from here."""
         return self.steps < longer.steps and not self.replace(steps=longer.steps).differing(longer)
 
+    def beginning_as(self, before: "RunSettings") -> "RunSettings":
+        """The same with the warm-up of another run, if a share of the steps decides it."""
+        chosen, first = self.hyperparameters, before.hyperparameters.algorithm_kwargs
+        if chosen.warm_up is None or "learning_starts" not in first:
+            return self
+        return self.replace(hyperparameters=chosen.learning_from(first["learning_starts"]))
+
     @property
     def agent_steps(self) -> int:
         """Of training, as its agent counts them."""

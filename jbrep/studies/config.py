@@ -23,7 +23,7 @@ from jbrep.records.document import Document, read_toml, toml_text
 from jbrep.records.record import Record, converted, from_plain, pattern, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.learner import Learner
-from jbrep.rl.presets import learns_from
+from jbrep.rl.presets import ALGORITHMS, learns_from
 from jbrep.rl.settings import MAX_STEPS, Seed, TrainingSettings
 from jbrep.stats.claims import NOT_WORSE
 from jbrep.stats.pairs import FEWEST_UNITS, linked_units
@@ -355,7 +355,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 "verdicts.claims."
             )
         for learner in map(self.learner, self.algorithms):
-            first = learns_from(learner.algorithm, learner.hyperparameters)
+            first = learns_from(learner.algorithm, learner.hyperparameters.within(self.steps))
             if self.steps <= first:
                 lines.append(
                     f"{learner.name} learns from step {first:,} on: {self.steps:,} steps leave its "
@@ -390,6 +390,8 @@ def as_study(given: Mapping[str, Any]) -> Study:
         learners = {name: _learner(name, table).table for name, table in tables.items()}
         given["algorithms"] = [*tables]
         given["learners"] = {name: table for name, table in learners.items() if table}
+    if isinstance(names := given.get("algorithms"), list):
+        given["algorithms"] = [Learner.of(n).name if n in ALGORITHMS else n for n in names]
     return from_plain(given, Study)
 
 
