@@ -73,7 +73,7 @@ class Learner(Record, frozen=True, kw_only=True):
                 `base` names none, which may be a file; `draws`, lists of values by setting; and
                 overrides.
         """
-        overrides = dict(table)
+        overrides, name = dict(table), cls.of(name).name if name in ALGORITHMS else name
         draws = _draws(overrides.pop("draws", {}))
         base, preset = overrides.pop("base", name), overrides.pop("preset", "")
         if not isinstance(base, str) or not isinstance(preset, str):

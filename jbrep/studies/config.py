@@ -23,7 +23,7 @@ from jbrep.records.document import Document, read_toml, toml_text
 from jbrep.records.record import Record, converted, from_plain, pattern, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.learner import Learner
-from jbrep.rl.presets import ALGORITHMS, learns_from
+from jbrep.rl.presets import learns_from
 from jbrep.rl.settings import MAX_STEPS, Seed, TrainingSettings
 from jbrep.stats.claims import NOT_WORSE
 from jbrep.stats.pairs import FEWEST_UNITS, linked_units
@@ -165,6 +165,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     def check(self) -> None:
         super().check()
         force_setattr(self, "data", _read_data(self.data))
+        force_setattr(self, "algorithms", tuple(self.learner(n).name for n in self.algorithms))
         for name in ("tasks", "algorithms", "representations", "seeds"):
             values = list(getattr(self, name))
             if name == "representations":
@@ -173,8 +174,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 raise InputError(f"{name} is {values}: it must have each once")
         self._check_tasks()
         Domain(**read_ranges(self.domain or {}))
-        for algorithm in self.algorithms:
-            self.learner(algorithm)
         self._check_data()
         self._check_verdicts()
 
@@ -390,8 +389,6 @@ def as_study(given: Mapping[str, Any]) -> Study:
         learners = {name: _learner(name, table).table for name, table in tables.items()}
         given["algorithms"] = [*tables]
         given["learners"] = {name: table for name, table in learners.items() if table}
-    if isinstance(names := given.get("algorithms"), list):
-        given["algorithms"] = [Learner.of(n).name if n in ALGORITHMS else n for n in names]
     return from_plain(given, Study)
 
 
