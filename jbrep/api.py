@@ -82,14 +82,16 @@ class Agent(NamedTuple):
         return load_policy(self.folder, self.encoder)
 
     def __repr__(self) -> str:
+        from jbrep.play.references import mean_text
         from jbrep.rl.files import FINISHED
-        from jbrep.text import returns_text
 
         settings = self.record.settings
         what = f"{settings.learner} on {settings.representation}, {settings.task}"
         if self.record.status != FINISHED:
             return f"Agent({what}: {self.record.reason})"
-        return f"Agent({what}: {returns_text(self.returns)}; {str(self.folder)!r})"
+        return (
+            f"Agent({what}: {mean_text(settings.environment, self.returns)}; {str(self.folder)!r})"
+        )
 
 
 class Judged(NamedTuple):

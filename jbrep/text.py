@@ -6,7 +6,7 @@ import shutil
 import sys
 import textwrap
 import unicodedata
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain, count
 from typing import NamedTuple, TypeVar
 
@@ -203,8 +203,3 @@ def interval_of(returns: Iterable[float]) -> str:
     """The same for a reader: 812 [650, 901]."""
     median, low, high = rounded(*percentiles(returns).values())
     return f"{median} [{low}, {high}]"
-
-
-def returns_text(returns: Collection[float]) -> str:
-    """The same with what it is: 812 [650, 901], median [10 %, 90 %] of 20 episodes."""
-    return f"{interval_of(returns)}, median [10 %, 90 %] of {counted(len(returns), 'episode')}"

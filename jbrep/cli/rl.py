@@ -10,9 +10,6 @@ from jbrep.cli.base import RESUMES, command, say, tell
 from jbrep.cli.signals import stop_signals, stoppable
 from jbrep.errors import StoppedError
 from jbrep.parameters import DrawnTask
-from jbrep.text import returns_text
-
-_BESIDE = 10  # episodes of policies that don't learn
 
 
 @command("rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a")
@@ -25,7 +22,7 @@ def _rl(
         from jbrep.encoders.shipped import source_of
         from jbrep.envs.infos import shares_text
         from jbrep.envs.make import is_one_robot
-        from jbrep.play.references import beside
+        from jbrep.play.references import beside, mean_text
         from jbrep.rl.files import EVALUATIONS, RUN, last_infos, read_evaluations, read_infos
 
         with _told_when_stopped(received, f"; {RESUMES}" if task.reproducible else ""):
@@ -34,14 +31,13 @@ def _rl(
         say(f"the run failed: {agent.record.reason}; see {out / RUN}", err=True)
         return True
     returns = agent.returns
-    name = agent.record.settings.representation
-    tell(f"returns on {name} at the end: {returns_text(returns)}")
+    shown = f"final return on {agent.record.settings.representation}"
     if told := shares_text(last_infos(read_infos(out), read_evaluations(out))):
         tell(told)
     with stoppable("the run itself is finished"):
         alone = is_one_robot(task, options.get("threads"))
-        if not alone and (compared := beside(task, returns, min(len(returns), _BESIDE))):
-            tell(str(compared))
+        compared = None if alone else beside(task, returns)
+        tell(f"{shown} {compared or mean_text(task, returns)}")
     tell(f"encoder: {source_of(options.get('encoder', 'full'), task)}; all evaluations:")
     say(str(out / EVALUATIONS))
     return False

@@ -29,6 +29,7 @@ from jbrep.studies.tables import by_run, run_of
 
 RUNNING = "running mean and variance"  # of what agents see, where they normalise it
 _NOT_SHOWN = ("task", "representation", "encoder", "encoder_code")  # among the settings
+_MOST_NAMED = 4  # representations in a title
 Numbers = dict[str, Score]  # by name, each with its 95 % interval; None where it isn't known
 
 
@@ -218,7 +219,7 @@ class Findings(Document, frozen=True, kw_only=True):
         top = planned.rules.top
         return cls(
             name=tables.name,
-            title=(record.study.title if record.study else "") or tables.name,
+            title=(record.study.title if record.study else "") or _title(tables),
             tasks=[*record.tasks],
             algorithms=[*dict.fromkeys(each.learner for each in settings)],
             representations=in_order((each.representation for each in settings), FULL),
@@ -418,6 +419,15 @@ def _settings(tables: Tables) -> dict[str, dict[str, Any]]:
         shown = {name: value for name, value in every.items() if name not in _NOT_SHOWN}
         found.setdefault(f"{shared.settings.task}/{shared.settings.learner}", shown)
     return found
+
+
+def _title(tables: Tables) -> str:
+    """What was studied, where its file has no title."""
+    seen = in_order(
+        (label.settings.representation for label in tables.record.labels.values()), FULL
+    )
+    shown = ", ".join(seen) if len(seen) <= _MOST_NAMED else f"{len(seen)} representations"
+    return f"{', '.join(tables.record.tasks)}: {shown}"
 
 
 def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

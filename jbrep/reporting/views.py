@@ -13,7 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from jbrep.evaluation.evaluation import Score
 from jbrep.reporting.findings import Agents, Comparison, Findings, Group, RunFound, Verdict
 from jbrep.stats.scale import LOOKING
-from jbrep.text import SIGNIFICANT, Table, interval, number, percentiles, rounded, wrapped
+from jbrep.text import SIGNIFICANT, Table, interval, number, r2_text, rounded, wrapped
 
 Cells = Mapping[str, Callable[[Any], str]]  # of a row, by the heads of columns
 _MOST_DIGITS = 9  # after the point
@@ -21,6 +21,7 @@ _LEAST_LACKING = 1e-12  # of 1, in a level: floating-point numbers tell no more 
 # what would be read as markup: an underscore within a word and a bracket without a link are not
 _WITHIN_A_LINE = r"[\\`*<|~#]|&(?=[#\w])|(?<!\w)_|_(?!\w)|!(?=\[)|\](?=[(\[:])"
 _UNKNOWN = Score(None)
+_ADVICE = "rewarded"  # the diagnostic by which encoders are recommended
 _NAME: Cells = {"representation": lambda each: each.representation}
 
 
@@ -107,6 +108,12 @@ def _returns_table(name: str, groups: Sequence[Group], found: Findings, brief: b
     first, several, form = groups[0], len(groups) > 1, return_form(groups)
     gain = f"share of gain on {found.baseline}"
     kept = {each.representation: each.numbers["share_of_gain"] for each in first.compared}
+    advised = {
+        name: value
+        for each in found.diagnostics
+        if (each.task, each.algorithm, each.diagnostic) == (first.task, first.algorithm, _ADVICE)
+        for name, value in zip(each.representations, each.values, strict=True)
+    }
     shares = dict.fromkeys(share for g in groups for each in g.agents for share in each.shares)
     columns: Cells = {
         "runs": lambda each: str(len(each.seeds)),
@@ -115,6 +122,11 @@ def _returns_table(name: str, groups: Sequence[Group], found: Findings, brief: b
         "learned": lambda each: each.learnt,
         "score": _number("score", ".2f"),
         "rising": lambda each: "yes" if each.rises else "-",
+        **(
+            {f"predicted ({_ADVICE})": lambda each: r2_text(advised.get(each.representation))}
+            if advised
+            else {}
+        ),
         gain: lambda each: interval(kept.get(each.representation, _UNKNOWN), ".2f"),
         "rise in the last fifth": _number("rise", form),
         **{f"share of {n}": partial(_share, n) for n in shares},
@@ -309,20 +321,16 @@ def run_tables(found: Findings) -> list[Table]:
 def last_returns(found: Findings) -> Table:
     """A row for each finished or failed run, with its last evaluation."""
     names = dict.fromkeys(name for run in found.runs for name in run.shares)
-
-    def returns(values: Sequence[float]) -> str:
-        return "{} [{}, {}]".format(*rounded(*percentiles(values).values())) if values else "-"
-
     columns: Cells = {
         "run": lambda run: run.label,
         "seed": lambda run: str(run.seed),
         "status": lambda run: run.status,
         "steps": lambda run: f"{run.steps:,}",
-        "return": lambda run: returns(run.returns),
+        "final return": lambda run: rounded(np.mean(run.returns))[0] if run.returns else "-",
         **{f"share of {name}": partial(_share, name) for name in names},
         "minutes": lambda run: f"{run.minutes:.1f}",
     }
-    title = "Runs that have ended, with the median and 10 to 90 % of their last evaluation"
+    title = "Runs that have ended; final returns are means over the last evaluation"
     return Table.of(title, found.runs, columns)
 
 

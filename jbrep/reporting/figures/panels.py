@@ -65,6 +65,7 @@ _SHADES = (0.75, 0.5)  # of a colour, where colours are used again
 _ROOM = 0.04  # of an axis, at its ends, for whole markers
 _FILLED = 1 / 3  # of an axis, at least, by the values themselves
 _BEYOND = 0.25  # of their range, for the ends of intervals on either side
+_NAMES_APART = 0.06  # of an axis, between names of lines
 _JITTER = 0.16  # between the outermost runs and the middle of their column
 _CHARACTER, _HANDLE, _LINE = 0.05, 0.5, 0.14  # of a legend: widths, height of a line [inches]
 _USUAL_LINES = 3  # of a legend, that figures have room for
@@ -205,8 +206,13 @@ def column(rows: Iterable[Row], name: str) -> NDArray[np.float64]:
     return np.array([row[name] for row in rows], float)
 
 
-def line(x: str, y: str, low: str = "", high: str = "", bars: bool = False, **style: Any) -> Mark:
-    """A mark: a line through numbers, with a band or bars between the columns of their ends."""
+def line(
+    x: str, y: str, low: str = "", high: str = "", bars: bool = False, final: str = "", **style: Any
+) -> Mark:
+    """A mark: a line through numbers, with a band or bars between the columns of their ends.
+
+    With `final`, the number in that column is marked beyond the last one, beside its name.
+    """
 
     def draw(axes: Axes, rows: Sequence[Row], look: Look, name: str, _: int) -> None:
         at, value = column(rows, x), column(rows, y)
@@ -221,9 +227,34 @@ def line(x: str, y: str, low: str = "", high: str = "", bars: bool = False, **st
             axes.fill_between(
                 at, ends[0], ends[1], color=look["color"], alpha=0.13, lw=0, step=step
             )
-        axes.plot(at, value, clip_on="drawstyle" in style, **how)
+        axes.plot(
+            at, value, clip_on="drawstyle" in style, **how | ({"label": "_"} if final else {})
+        )
+        if final:
+            own = {"color": look["color"], "clip_on": False}
+            axes.plot(at[-1:], column(rows[-1:], final), marker="D", ms=3, ls="none", **own)
+            _name_at_end(axes, float(at[-1]), float(column(rows[-1:], final)[0]), name, own)
 
     return draw
+
+
+def _name_at_end(axes: Axes, at: float, value: float, name: str, look: Mapping[str, Any]) -> None:
+    """Write the name of a line beside its end, where it hits no other's."""
+    low, high = axes.get_ylim()
+    taken = [text.get_position()[1] for text in axes.texts]
+    apart = _NAMES_APART * (high - low)
+    free = (value + sign * n * apart / 2 for n in range(40) for sign in (1, -1))
+    place = next(y for y in free if all(abs(y - other) >= apart for other in taken))
+    axes.text(
+        1.03,
+        place,
+        name.partition(" (n")[0],
+        size=6,
+        va="center",
+        color=look["color"],
+        transform=axes.get_yaxis_transform(),
+        clip_on=False,
+    )
 
 
 def runs_and_mean(value: str, mean: str, low: str, high: str) -> Mark:

@@ -120,10 +120,12 @@ def _final(found: Findings) -> Iterator[Row]:
 
 def _curves(found: Findings) -> Iterator[Row]:
     for group, each, key in _agents(found):
-        curve = [each.curve[name] for name in ("p10", "p50", "p90", "iqm")]
-        for step, low, middle, high, iqm in zip(group.grid, *curve, strict=True):
-            of_runs = {"p10": low, "p50": middle, "p90": high}
-            yield {**key, "step": int(step), **of_runs, **_numbers("iqm", iqm)}
+        curve = [each.curve[name] for name in ("p10", "mean", "p90", "iqm")]
+        final = each.numbers["final_return_mean"].value
+        for step, low, mean, high, iqm in zip(group.grid, *curve, strict=True):
+            of_runs = {"p10": low, "mean": mean, "p90": high}
+            ended = final if step == group.grid[-1] else None
+            yield {**key, "step": int(step), **of_runs, "final": ended, **_numbers("iqm", iqm)}
 
 
 def _numbers(name: str, values: Sequence[float | None]) -> dict[str, float | None]:
@@ -241,12 +243,13 @@ _PLOTS = (
     _Spec(
         "representations",
         "Return over training by representation",
-        "Return of the deterministic policy over training: median and 10 to 90 % over n "
-        f"runs.{_DASHED}",
+        "Return of the deterministic policy over training: mean and 10 to 90 % over n runs. The "
+        "diamond at the end is the final return of the table, from more starts than the curve has."
+        f"{_DASHED}",
         _curves,
-        line("step", "p50", "p10", "p90"),
+        line("step", "mean", "p10", "p90", final="final"),
         ("training step", "return"),
-        values=("p10", "p90"),
+        values=("p10", "p90", "final"),
         together=("task",),
         played=lambda group: group.in_training,
         more={"finish": _training},
