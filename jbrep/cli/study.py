@@ -1,5 +1,6 @@
 """Studies: many agents, and what the statistics say of them."""
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,13 +11,15 @@ from jbrep.cli.base import RESUMES, command, say, say_json, tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError, choose
 from jbrep.parameters import AsJson, Backend, Workers, find_study
-from jbrep.text import Table, duration, terminal_width
+from jbrep.text import Table, counted, duration, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.reporting.report import Report
     from jbrep.reporting.views import Cells
     from jbrep.stats.rules import Planned
     from jbrep.studies.forecast import Forecast
+
+_WATCH_EVERY = 30.0  # seconds
 
 
 @command("study demo --out runs/demo")
@@ -125,6 +128,7 @@ def report(
     /,
     *,
     everything: Annotated[bool, Meta(extra={"option": "all"})] = False,
+    watch: bool = False,
     as_json: AsJson = False,
     **options: Annotated[Any, api.report],
 ) -> None:
@@ -135,8 +139,14 @@ def report(
 
     Args:
         everything: print every table; the page has them.
+        watch: write it again every 30 s until all runs have ended; the page reloads itself.
     """
-    _show(api.report(folder, **options), everything, as_json)
+    made = api.report(folder, **options)
+    while watch and (left := len(made.findings.missing)):
+        tell(f"{counted(left, 'run')} to go: {made.page}", err=True)
+        time.sleep(_WATCH_EVERY)
+        made = api.report(folder, **options)
+    _show(made, everything, as_json)
 
 
 def _show(made: "Report", everything: bool = False, as_json: bool = False) -> None:
