@@ -2,14 +2,10 @@
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 from command import jbrep
-from sklearn.decomposition import PCA
-from sklearn.linear_model import Ridge
 from sklearn.metrics import r2_score
-from sklearn.preprocessing import StandardScaler
 from wide import make_feature, make_task, wide
 
 from jbrep.dataset import ScaledDataset, Scaler
@@ -19,12 +15,10 @@ from jbrep.encoders.shipped import unlearned
 from jbrep.errors import InputError
 from jbrep.evaluation import diagnose
 from jbrep.evaluation.diagnosis import seen, write
-from jbrep.evaluation.evaluation import EVALUATION, Evaluation, Judged
+from jbrep.evaluation.evaluation import EVALUATION, Evaluation
 from jbrep.evaluation.held_out import MAX_NUMBERS, HeldOut, sample_rows
-from jbrep.evaluation.readout import dynamics, latent_units, probes, quantities
+from jbrep.evaluation.readout import every, latent_units
 from jbrep.evaluation.reconstruction import reconstruction
-from jbrep.evaluation.regression import ridge
-from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.controls import Random
 from jbrep.methods.linear import principal_code
 from jbrep.records.document import read_document
@@ -159,28 +153,7 @@ def test_dead_units_are_found(held_out):
     assert 1 < result.participation_ratio < 2
 
 
-def test_quantities_are_those_of_the_simulated_body():
-    task = TASKS["move_to_pose"].describe()
-    random = np.random.default_rng(0)
-    rows = random.normal(size=(50, task.size))
-    rows[:, 3:7] /= np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
-    result = quantities(task, rows)
-    for i, row in enumerate(rows):
-        rotation = np.empty(9)
-        mujoco.mju_quat2Mat(rotation, row[3:7])
-        face = -rotation.reshape(3, 3)[:2, 1]
-        face /= np.linalg.norm(face)
-        np.testing.assert_allclose(result["heading"][i], face, atol=1e-9)
-        assert result["uprightness"][i, 0] == pytest.approx(rotation[8])
-        assert result["forward_speed"][i, 0] == pytest.approx(face @ row[7:9])
-        np.testing.assert_allclose(result["motor_phase"][i], (np.cos(row[13]), np.sin(row[13])))
-        ahead, left = -row[16], row[15]
-        bearing = np.arctan2(*result["bearing_of_target"][i][::-1])
-        assert bearing == pytest.approx(np.arctan2(left, ahead))
-        np.testing.assert_allclose(result["angle_to_target"][i], (np.cos(row[18]), np.sin(row[18])))
-
-
-def test_any_other_robots_truth_is_every_feature():
+def test_probes_are_of_every_feature():
     features = [
         make_feature("height", "m", -1, 1, bounded=True),
         make_feature("yaw", "rad", -np.pi, np.pi, bounded=True, kind="angle"),
@@ -190,7 +163,7 @@ def test_any_other_robots_truth_is_every_feature():
     ]
     robot = make_task(features, name="my_package/Robot-v0")
     rows = np.random.default_rng(0).uniform(-3, 3, (20, 5))
-    result = quantities(robot, rows)
+    result = every(robot, rows)
     assert list(result) == ["height", "yaw", "turns", "knee", "unknown"]
     np.testing.assert_array_equal(result["turns"], rows[:, 2:3])
     np.testing.assert_allclose(result["yaw"], np.stack((np.cos(rows[:, 1]), np.sin(rows[:, 1])), 1))
@@ -203,76 +176,9 @@ def test_a_wide_robot_can_be_judged(tmp_path):
     data = wide([1, 300, 2, 1, 250, 99, 1, 180], features=70)
     evaluation = write({"r-20": make(data, projection(data, 20, 0))}, data, tmp_path)
     for result in evaluation.encoders.values():
-        assert set(result.probes["obs_0"]) == {None}  # it is constant
+        assert set(result.nonlinear_probes["obs_0"]) == {None}  # it is constant
     shown = evaluation_text(evaluation, 100, everything=True)
     assert max(map(len, shown.splitlines())) <= 100
-
-
-def test_probes_are_ridge_regressions(held_out, coder):
-    train, test = observed(held_out, "train"), observed(held_out, "test")
-    result = probes(coder, held_out)
-    scaler = StandardScaler().fit(coder.encode(train))
-    wanted, true = (quantities(held_out.data.task, rows) for rows in (train, test))
-    for name, values in result.items():
-        fitted = Ridge(1.0).fit(scaler.transform(coder.encode(train)), wanted[name])
-        predicted = fitted.predict(scaler.transform(coder.encode(test))).reshape(len(test), -1)
-        expected = r2_score(true[name], predicted, multioutput="variance_weighted")
-        assert values[0] == pytest.approx(expected, rel=1e-3, abs=1e-3)
-
-
-def test_a_unit_that_is_rounding_where_a_regression_is_fitted_does_not_outweigh_the_others():
-    values, noise = np.random.default_rng(0).normal(size=(2, 1000, 3)).astype(np.float32)
-    wanted, unseen = values[:, :2] + noise[:, :2], values.copy()
-    unseen[:, 2] = 0.02
-    expected = ridge(values[:, :2], wanted)(unseen[:, :2])
-    values[:, 2] = 5e-9 * noise[:, 2]
-    assert np.abs(ridge(values, wanted)(unseen) - expected).max() < 2
-
-
-def judged(encoder, held_out):
-    """Of which nothing else is known."""
-    return Judged(encoder, held_out, None, None, None)
-
-
-def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
-    dataset = held_out.data.dataset
-    parts, changes = [], []
-    for rows in (held_out.data.train, held_out.data.test):
-        kept = rows[dataset["step"][rows] < 999]
-        now, then = (dataset["observation"][each] for each in (kept, kept + 1))
-        turns = [each.is_full_turn for each in dataset.task.features]
-        change = np.subtract(then, now, dtype=np.float64)
-        change[:, turns] = (change[:, turns] + np.pi) % (2 * np.pi) - np.pi  # the shorter way
-        changes.append(change)
-        inputs = np.column_stack((coder.encode(now), dataset["action"][kept]))
-        parts.append((inputs, coder.encode(then)))
-    (known, after), (unseen, true) = parts
-    whiten = PCA(whiten=True).fit(known[:, :4]).transform
-    after, true = whiten(after), whiten(true)
-    known, unseen = (np.column_stack((whiten(v[:, :4]), v[:, 4])) for v in (known, unseen))
-    scaler = StandardScaler().fit(known)
-    predicted = Ridge(1.0).fit(scaler.transform(known), after).predict(scaler.transform(unseen))
-    linear, persistence, change = dynamics(judged(coder, held_out))
-    expected = r2_score(true, predicted, multioutput="variance_weighted")
-    assert linear[0] == pytest.approx(expected, abs=1e-3)
-    still = r2_score(true, unseen[:, :4], multioutput="variance_weighted")
-    assert persistence[0] == pytest.approx(still, abs=1e-3)
-    assert linear[0] > persistence[0]
-    fitted = Ridge(1.0).fit(scaler.transform(known), changes[0] / changes[0].std(axis=0))
-    predicted, true = fitted.predict(scaler.transform(unseen)), changes[1] / changes[0].std(axis=0)
-    expected = r2_score(true, predicted, multioutput="variance_weighted")
-    assert change[0] == pytest.approx(expected, abs=1e-3)
-
-
-def test_units_mixed_or_scaled_do_not_change_how_well_the_next_is_read(held_out, coder):
-    mixed = np.random.default_rng(0).normal(size=(4, 4)) * [[9], [1], [1], [0.1]]
-    (layer,) = coder.encoder
-    weight, bias = ((mixed @ each).astype(np.float32) for each in (layer.weight, layer.bias))
-    turned = (layer._replace(weight=weight, bias=bias),)
-    other = Encoder(coder.header, coder.scaler, turned, coder.decoder)
-    both = (dynamics(judged(each, held_out)) for each in (coder, other))
-    for one, two in zip(*both, strict=True):
-        assert one == pytest.approx(two, abs=1e-3)
 
 
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")

@@ -228,8 +228,8 @@ def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
     assert own["half"].reconstruction is None
     assert own["half"].scores["next"].value is not None
     assert own["whole"].reconstruction.mse.value < 1e-9
-    probe = own["whole"].probes["obs_1"].value
-    assert probe == pytest.approx(own["full"].probes["obs_1"].value, rel=1e-6)
+    probe = own["whole"].nonlinear_probes["obs_1"].value
+    assert probe == pytest.approx(own["full"].nonlinear_probes["obs_1"].value, rel=1e-6)
     assert (own["module"].kind, own["module"].latent) == ("own", 6)
     shown = evaluation_text(evaluation, everything=True)
     assert re.search(r"^half .* +- +-$", shown, re.MULTILINE)  # no error, in no unit

@@ -22,7 +22,7 @@ from jbrep.evaluation.evaluation import (
 )
 from jbrep.evaluation.held_out import HeldOut, Rows, explained, sample_rows
 from jbrep.evaluation.prediction import Matters, following
-from jbrep.evaluation.regression import Networks, Problem, ridge
+from jbrep.evaluation.regression import Networks, Problem
 from jbrep.stats.bootstrap import Array, by_episode
 
 GAMMA = 0.99
@@ -127,20 +127,14 @@ def value(e: Judged) -> Score | None:
     return explained(predicted, states.value, states.rows, states.sums)[0]
 
 
-@diagnostic(
-    Scalar("action", "R² of a good policy's action", is_first=True),
-    Scalar("action_linear", "the same, linear"),
-)
-def action(e: Judged) -> tuple[Score | None, Score | None]:
+@diagnostic(Scalar("action", "R² of a good policy's action", is_first=True))
+def action(e: Judged) -> Score | None:
     """R^2 of what the policy would do in held-out rows, from the latent."""
     if e.policy is None:
-        return None, None
-    seen, taken, _ = e.held_out.once(_acting, e.policy, "train")
+        return None
     unseen, true, rows = e.held_out.once(_acting, e.policy, "test")
-    latent, linear = e.encoder.encode(unseen), ridge(e.encoder.encode(seen), taken)
-    told = (predict(latent) for predict in (e.learnt.of_policy["action"], linear))
-    found = [explained(each, true, rows, e.held_out.sums)[0] for each in told]
-    return found[0], found[1]
+    predicted = e.learnt.of_policy["action"](e.encoder.encode(unseen))
+    return explained(predicted, true, rows, e.held_out.sums)[0]
 
 
 def _acting(

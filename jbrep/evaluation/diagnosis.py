@@ -127,7 +127,6 @@ def _side_by_side(
                 scores={},
                 prediction={},
                 loses=(),
-                probes=readout.probes(encoder, held_out),
                 nonlinear_probes=read,
                 reconstruction=reconstruction(encoder, held_out) if encoder.can_decode else None,
                 latent_units=readout.latent_units(encoder, held_out),

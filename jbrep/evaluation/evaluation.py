@@ -111,8 +111,7 @@ class Diagnostics(Record, frozen=True, kw_only=True):
     scores: Scores  # the registered diagnostics, as far as they are known
     prediction: dict[str, Prediction]  # by the number of steps ahead
     loses: tuple[Lost, ...]  # the most needed first
-    probes: Scores  # R^2 of each quantity, linear
-    nonlinear_probes: Scores  # R^2 of each quantity and feature
+    nonlinear_probes: Scores  # R^2 of each feature
     reconstruction: Reconstruction | None  # None of an encoder that doesn't decode
     latent_units: LatentUnits
     method: dict[str, Any]  # what the method says of its own fit, with KEPT
@@ -146,7 +145,7 @@ class Evaluation(Document, frozen=True, kw_only=True):
     """Encoders side by side, the full observation first."""
 
     format: ClassVar[str] = "jbrep evaluation"
-    format_version: ClassVar[int] = 4
+    format_version: ClassVar[int] = 5
     indent: ClassVar[int] = 1
 
     data: JudgedOn

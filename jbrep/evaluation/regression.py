@@ -1,4 +1,4 @@
-"""Regressions of many quantities at once: linear ones, and networks whose time is bounded."""
+"""Regressions of many quantities at once, by networks whose time is bounded."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -24,30 +24,7 @@ _LEARNING_RATE = 1e-2  # at its highest
 _RISING = 0.1  # the share of the steps in which the learning rate rises to that
 _LIMIT = 5.0  # standard deviations within which the network sees its input
 _NEGLIGIBLE = 1e-9  # standard deviation, as a share of the largest magnitude: rounding
-_FAR = 20.0  # standard deviations within which ridge regressions see theirs
 _BLOCK = 1 << 13  # rows predicted at a time
-_PENALTY = 1.0  # of the ridge, on standardised values
-
-
-def ridge(values: NDArray[Any], wanted: NDArray[Any]) -> Predictor:
-    """Ridge regressions of all columns (n, k) on standardised values (n, l), as a map.
-
-    Far values count as those at 20 standard deviations: a unit that is constant but for rounding
-    where the regression is fitted could otherwise outweigh all others where it isn't.
-    """
-    from sklearn.linear_model import Ridge  # not at the top: it takes seconds
-    from sklearn.preprocessing import StandardScaler
-
-    scaler, model = StandardScaler(), Ridge(_PENALTY)
-    # in float64: features may be as good as collinear
-    model.fit(scaler.fit_transform(values.astype(np.float64)), wanted)
-
-    def predict(others: NDArray[Any]) -> NDArray[Any]:
-        standardised = scaler.transform(others.astype(np.float64))
-        predicted: NDArray[Any] = model.predict(standardised.clip(-_FAR, _FAR))
-        return predicted.reshape(len(others), -1)
-
-    return predict
 
 
 class Problem(NamedTuple):

@@ -17,7 +17,7 @@ def diagnostics(latent=2, **known):
     lists = {"mean": [0.0] * latent, "variance": [1.0] * latent, "dead": []}
     nothing = {
         **{"kind": "made-up", "scores": {}, "prediction": {}, "loses": [], "method": {}},
-        **{"probes": {}, "nonlinear_probes": {}, "reconstruction": None},
+        **{"nonlinear_probes": {}, "reconstruction": None},
         "latent_units": LatentUnits(**lists, participation_ratio=None),
     }
     return Diagnostics(latent=latent, **{**nothing, **known})
