@@ -77,10 +77,6 @@ def test_held_out_rows_know_their_episodes(held_out):
     assert held_out.numbers.tolist() == np.unique(episode).tolist()
     (counts,) = held_out.sums(held_out.data.test, np.ones((len(episode), 1)))
     assert counts.ravel().tolist() == [1000, 1000, 1000]
-    followed = held_out.followed(held_out.data.test)
-    steps = held_out.data.dataset["step"]
-    np.testing.assert_array_equal(steps[followed + 1], steps[followed] + 1)
-    assert len(followed) == 3 * 999
 
 
 def test_of_very_many_episodes_groups_are_resampled():

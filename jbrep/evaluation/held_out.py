@@ -61,10 +61,6 @@ class HeldOut:
         place = np.searchsorted(self.numbers, self._episode(rows))  # among those held out
         return place * self.num_groups // len(self.numbers)
 
-    def followed(self, rows: Rows) -> Rows:
-        """Those rows whose next row belongs to the same episode."""
-        return rows[self._ends[self._episode(rows)] > rows + 1]
-
     def sums(self, rows: Rows, *values: NDArray[Any]) -> list[Array]:
         """Sums of each array (n, k) over the rows of each group, (groups, k)."""
         group = self._group(rows)
