@@ -35,13 +35,11 @@ def many():
 
 def test_a_number_gives_the_same_body_and_another_number_another():
     one, same, other = draw(7, True), draw(7, True), draw(8, True)
-    assert one == same
+    assert one == same != other
     assert hash(one) == hash(same)
-    assert one != other
     for name in DRAWN:
         np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
         assert np.not_equal(getattr(one, name), getattr(other, name)).all()
-    assert repr(one) == "Body(number=7, materials=True)"
 
 
 def test_materials_leave_the_geometry_as_it_is():

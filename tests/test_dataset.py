@@ -1,7 +1,6 @@
 """Reading: columns over shards, splits, scaling, batches, and tools that know nothing of jbrep."""
 
 import json
-import pickle
 from itertools import accumulate
 
 import h5py
@@ -77,15 +76,12 @@ def test_a_column_as_an_array(column, parts):
     for dtype in (np.uint8, np.int8, np.int64):
         np.testing.assert_array_equal(column[np.array([2, 1], dtype)], whole[[2, 1]])
     assert column[()].shape == whole[()].shape == (12, 3)
-    with pytest.raises(IndexError, match="only the first axis can be indexed by an array"):
-        column[[0, 1], [0, 1]]
-    with pytest.raises(IndexError, match="a slice or a mask"):
-        column["motor"]
-    for key in (12, -13, [3, 12]):
-        with pytest.raises(IndexError, match="there are 12"):
-            column[key]
-    with pytest.raises(IndexError, match="the mask has shape"):
-        column[np.ones(5, dtype=bool)]
+
+
+@pytest.mark.parametrize("key", [12, -13, [3, 12], "motor", ([0, 1], [0, 1]), np.ones(5, bool)])
+def test_what_is_no_index_of_a_column(key, column):
+    with pytest.raises(IndexError):
+        column[key]
 
 
 def test_a_slice_within_a_shard_is_a_view_of_the_file(dataset):
@@ -115,11 +111,6 @@ def test_an_array_of_a_column_is_the_reader_s_own(dataset, collected, tmp_path):
         assert isinstance(data["reward"][5], np.float32)
 
 
-def test_another_process_opens_it_anew(dataset):
-    again = pickle.loads(pickle.dumps(dataset))
-    np.testing.assert_array_equal(again["reward"], dataset["reward"])
-
-
 def test_episodes_have_columns_of_their_own(dataset):
     episodes = dataset.episodes
     np.testing.assert_array_equal(episodes["episode"], np.arange(5))
@@ -137,7 +128,6 @@ def test_an_episode_is_its_rows_and_what_is_stored_once_for_it(dataset):
         np.testing.assert_array_equal(episode[name], dataset[name][3000:4000])
     assert episode.record["seed"] == 4 * 2**32 + 3
     np.testing.assert_array_equal(episode.record["initial_qpos"], dataset["qpos"][3000])
-    assert repr(episode).startswith("Episode(3 of ")
     for number in (5, -1):
         with pytest.raises(InputError, match=f"no episode {number}: it has 5, numbered from 0"):
             dataset.episode(number)
@@ -152,9 +142,8 @@ def test_the_split_is_by_episode_and_seeded(dataset):
     np.testing.assert_array_equal(test, dataset.split().test)
     assert len({tuple(np.unique(episode[dataset.split(seed=s).test])) for s in range(20)}) > 1
     assert len(np.unique(episode[dataset.split(test=0.99).test])) == 4
-    for share in (0, 1, -0.2):
-        with pytest.raises(InputError, match="must be between 0 and 1"):
-            dataset.split(test=share)
+    with pytest.raises(InputError, match="between 0 and 1"):
+        dataset.split(test=1)
 
 
 def test_scaling_is_fitted_on_the_rows_that_are_given(dataset):
@@ -191,28 +180,15 @@ def test_a_reader_sees_whole_shards_while_a_collector_writes(collected, tmp_path
     assert Dataset(tmp_path / "growing").manifest.complete
 
 
-def test_the_card_tells_what_is_there(dataset, collected):
-    text = dataset.card()
-    for part in ("16 features, 1 action", "uniform", "rows        5,000", "5 shards"):
-        assert part in text
-    low, median, high = np.percentile(dataset.episodes["return"], (10, 50, 90))
-    assert f"median {median:,.1f} [10 % {low:,.1f}, 90 % {high:,.1f}]" in " ".join(text.split())
-    speed = dataset["motor_velocity"][:].astype(float)
-    line = next(line for line in text.splitlines() if "motor_velocity" in line).split()
-    assert [float(word) for word in line[2:6]] == pytest.approx(
-        [speed.min(), speed.mean(), speed.max(), speed.std()], rel=1e-3
-    )
-    assert dataset.fingerprint in text
-
-
 def test_a_data_set_as_json(dataset):
     about = json.loads(jbrep("data", "info", dataset.folder, "--json").stdout)
     assert (about["task"], about["rows"], about["episodes"]) == ("face_direction", 5000, 5)
     assert about["return"]["mean"] == pytest.approx(dataset.episodes["return"].mean())
-    speed = about["features"][14]
-    assert (speed["feature"], speed["unit"]) == ("motor_velocity", "rad/s")
-    assert speed["nominal"] == [-180, 180]
-    assert speed["max"] == dataset["motor_velocity"][:].max()
+    shown, speed = about["features"][14], dataset["motor_velocity"][:].astype(float)
+    assert (shown["feature"], shown["unit"]) == ("motor_velocity", "rad/s")
+    assert shown["nominal"] == [-180, 180]
+    assert [shown[name] for name in ("min", "max")] == [speed.min(), speed.max()]
+    assert f"{speed.std():.3g}" in dataset.card()
 
 
 def test_an_unfinished_data_set_is_called_so(collected, tmp_path):

@@ -114,12 +114,6 @@ def test_observations_share_no_memory(task):
         assert not any(np.may_share_memory(array, b) for b in arrays[i + 1 :])
 
 
-def test_a_generator_may_be_passed(task):
-    random = np.random.RandomState(7)
-    environment = load(task, task_kwargs={"random": random})
-    assert environment.task.random is random
-
-
 def test_every_lane_has_the_same_episode_bit_for_bit(task):
     """A plain dm_control environment and a lane among others, over two episodes."""
     environment = jitterbug.load(task, seed=5, time_limit=1)

@@ -52,10 +52,6 @@ def test_the_swing_is_driven_through_the_bearing_and_turned_back_beyond_it():
         assert side * walk_toward(beyond, bearing, WALK)[0, 0] < -0.2
 
 
-def test_a_weight_at_rest_is_set_in_motion_off_the_bearing():
-    assert walk_toward(state(1.0, 0.0), np.zeros((1, 1)), WALK)[0, 0] < -0.5
-
-
 def test_turning_goes_by_the_shorter_side_and_rests_when_near():
     def drive(angle, **motion):
         return turn_by(state(0.0, **motion), np.array([[angle]]), TURN)[0, 0]

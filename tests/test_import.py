@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import warnings
-import zipfile
 from pathlib import Path
 
 import gymnasium
@@ -98,7 +97,6 @@ def test_arrays_become_a_data_set(written):
     )
     assert (task.max_episode_steps, task.reproducible) == (12, False)
     assert settings.policy == {"kind": "imported", "source": "pushes of a pole, 2019"}
-    assert "no episode can be simulated again" in written.card()
 
 
 def test_a_list_of_episodes_gives_the_same(written, tmp_path):
@@ -144,9 +142,6 @@ def test_a_data_frame_names_the_features(tmp_path):
     dataset = from_arrays(tmp_path / "data", **given)
     assert dataset.task.feature_names == tuple(names)
     np.testing.assert_array_equal(dataset["joint_1"][0], given["observations"]["joint_1"][0])
-    given["observations"] = given["observations"].rename(columns={"joint_1": "joint 1 [rad]"})
-    other = from_arrays(tmp_path / "other", **given)
-    assert other.task.feature_names == ("joint_0", "joint_1_rad", "joint_2")
 
 
 def test_shards_are_of_the_usual_size_and_hold_many_chunks(tmp_path):
@@ -245,14 +240,6 @@ def d4rl(path, **changes):
     np.savez_compressed(path, **{**given, **changes})
 
 
-def test_an_npz_file_as_d4rl_names_its_arrays(tmp_path):
-    d4rl(tmp_path / "hopper.npz")
-    import_data(str(tmp_path / "hopper.npz"), tmp_path / "data")
-    dataset = Dataset(tmp_path / "data")
-    same(dataset, arrays())
-    assert dataset.task.id == "hopper"
-
-
 def plain_table(path, **changes):
     given = arrays()
     columns = {f"joint {i}": given["observations"][:, i] for i in range(3)}
@@ -331,30 +318,23 @@ def minari_copy(minari_folder, tmp_path, **changes):
     return str(folder)
 
 
-def test_an_environment_that_is_not_here_gives_the_task_its_id(minari_folder, tmp_path):
-    spec = {"id": "Carts/Cart-v3", "kwargs": {}, "max_episode_steps": 500}
-    folder = minari_copy(minari_folder, tmp_path, env_spec=json.dumps(spec))
-    assert "unknown task 'Carts/Cart-v3'" in import_data(folder, tmp_path / "data")
-    assert Dataset(tmp_path / "data").task.id == "Carts/Cart-v3"
-    assert Dataset(tmp_path / "data").task.max_episode_steps == 500
-
-
 @pytest.mark.parametrize(
     ("env_id", "expected"),
-    [(PENDULUM, PENDULUM), ("MountainCarContinuous-v0", "Minari-cart-push-v0")],
+    [
+        (PENDULUM, PENDULUM),
+        ("MountainCarContinuous-v0", "Minari-cart-push-v0"),  # it has other sizes
+        ("Carts/Cart-v3", "Carts/Cart-v3"),  # it isn't here, and gives the task its id
+    ],
 )
-def test_an_environment_that_is_here_is_described_if_it_fits(
+def test_an_environment_is_described_if_it_is_here_and_fits(
     env_id, expected, minari_folder, tmp_path
 ):
     spec = {"id": env_id, "kwargs": {}, "max_episode_steps": 50}
     folder = minari_copy(minari_folder, tmp_path, env_spec=json.dumps(spec))
-    why_no_task = import_data(folder, tmp_path / "data")
+    import_data(folder, tmp_path / "data")
     task = Dataset(tmp_path / "data").task
     assert (task.id, task.max_episode_steps) == (expected, 50)
-    if env_id == PENDULUM:
-        assert task == describe(PENDULUM, max_episode_steps=50)
-    else:
-        assert why_no_task == f"{env_id} has other sizes"
+    assert (task == describe(PENDULUM, max_episode_steps=50)) == (env_id == PENDULUM)
 
 
 def test_no_code_that_a_minari_data_set_names_is_run(minari_folder, tmp_path, monkeypatch):
@@ -377,7 +357,6 @@ def spoiled(name, place, value):
 
 BAD_ARRAYS = {  # words of the line that refuses them
     "row 3 observation": spoiled("observations", 3, np.nan),
-    "row 0 'action'": {"actions": arrays()["actions"] + np.inf},
     "reward 32 bits step": {"rewards": np.full(20, 1e39)},
     "20 observations 19 actions": {"actions": arrays()["actions"][1:]},
     "no actions": {"actions": None},
@@ -386,9 +365,9 @@ BAD_ARRAYS = {  # words of the line that refuses them
         "final_observations": np.zeros((3, 4)),
     },
     "action 0 2.5 [-2, 2]": spoiled("actions", 2, 2.5),
-    "observation images": {"observations": np.zeros((20, 64, 64, 3))},
     "observations sizes": {"observations": [[1, 2, 3]] * 19 + [[1, 2]]},
     "action int64": {"actions": np.zeros((20, 1), int)},
+    "terminated": {"terminations": np.arange(20) % 3},
     "no step two rows": {
         **{name: values[:1] for name, values in arrays().items()},
         "final_observations": None,
@@ -495,9 +474,6 @@ def test_a_gap_between_an_observation_and_the_next_is_noticed(tmp_path):
 def test_files_that_are_no_data_are_refused(tmp_path, minari_folder):
     for name in ("a.npz", "a.parquet", "a.pkl"):
         (tmp_path / name).write_bytes(b"nonsense" * 50)
-    with zipfile.ZipFile(tmp_path / "cut.npz", "w") as archive:
-        for name in ("observations", "actions", "rewards", "terminals"):
-            archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00")
     d4rl(tmp_path / "names.npz", feature_names=["one"])
     shutil.copytree(minari_folder / "cart/push-v0", tmp_path / "spoiled")
     (tmp_path / "spoiled/data/main_data.hdf5").write_bytes(b"nonsense")
@@ -505,8 +481,6 @@ def test_files_that_are_no_data_are_refused(tmp_path, minari_folder):
         "a.npz": "can't be read as an npz file",
         "a.parquet": "can't be read as a Parquet file",
         "a.pkl": "unknown format '.pkl'",
-        "no.npz": "there is no file",
-        "cut.npz": "can't be read as an npz file",
         "names.npz": "names of 1 numbers",
         "spoiled": "main_data.hdf5 can't be read as an HDF5 file",
     }.items():
@@ -544,29 +518,3 @@ def test_damage_is_noticed_and_nothing_is_simulated_again(written, tmp_path):
     assert len(list(find_problems(folder))) == 1
     with pytest.raises(InputError, match=r"import their source, pushes of a pole"):
         list(repair(folder))
-
-
-def test_the_command(tmp_path):
-    d4rl(tmp_path / "pole.npz")
-    out = tmp_path / "data"
-    done = jbrep("data", "import", tmp_path / "pole.npz", "--task", PENDULUM, "--out", out)
-    assert (done.exit_code, done.stderr) == (0, "")
-    assert done.stdout.endswith(f"3 episodes of {PENDULUM}, 20 rows, 0.0 MB in {out}\n")
-    done = jbrep("data", "import", tmp_path / "pole.npz", "--out", tmp_path / "alone")
-    assert done.stderr == "pole is made from the data alone: it names no environment\n"
-    done = jbrep("data", "import", tmp_path / "pole.npz", "--out", out)
-    assert done.exit_code == 2
-    assert done.stderr == f"Error: {out} exists already: choose another name\n"
-
-
-def test_an_end_must_be_true_or_false(tmp_path):
-    flat = {
-        "observations": np.zeros((6, 2), np.float32),
-        "actions": np.zeros((6, 1), np.float32),
-        "rewards": np.zeros(6, np.float32),
-        "terminations": np.array([0, 0, 2, 0, 0, 1]),
-    }
-    np.savez(tmp_path / "flat.npz", **flat)
-    told = jbrep("data", "import", tmp_path / "flat.npz", "--out", tmp_path / "out")
-    assert (told.exit_code, told.output.count("\n")) == (2, 1)
-    assert "a terminated" in told.output

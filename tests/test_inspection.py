@@ -11,6 +11,7 @@ import rerun as rr
 from command import jbrep
 from made_up import write_checkpoint
 from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
 from small import ONE_EACH
 
 from jbrep.encoders import find
@@ -67,13 +68,6 @@ def poses(entity):
     return values(entity, "Transform3D:translation")[:, 0], turned[:, [3, 0, 1, 2]]
 
 
-def rotate(quaternion, vector):
-    """Vectors (n, 3) rotated by quaternions (n, 4)."""
-    scalar, axis = quaternion[:, :1], quaternion[:, 1:]
-    across = np.cross(axis, vector)
-    return vector + 2 * (scalar * across + np.cross(axis, across))
-
-
 @pytest.fixture(scope="module")
 def robot(rollout):
     return Robot(rollout.motion.model)
@@ -97,12 +91,6 @@ def recorded(folder):
 @pytest.fixture(scope="module")
 def entities(recorded):
     return read(recorded)
-
-
-@pytest.fixture(scope="module")
-def unchanged(folder):
-    """Of an encoder that gives back what it took, on the task that observes most."""
-    return inspect(POSE, encoder="full", out=folder / "full.rrd")
 
 
 @pytest.fixture(scope="module")
@@ -141,15 +129,6 @@ def test_poses_are_the_episodes(entities, rollout):
             np.testing.assert_allclose(attitude[row], data.body(name).xquat, atol=3e-7)
 
 
-def test_the_timelines(entities):
-    entity = entities["/observation/position"]
-    np.testing.assert_array_equal(entity["step"].to_numpy(), np.arange(ROWS))
-    time = entity["time"].to_numpy(zero_copy_only=False) / np.timedelta64(10, "ms")
-    np.testing.assert_array_equal(time, np.arange(ROWS))
-    assert entities["/action"]["step"].to_numpy()[-1] == ROWS - 2
-    assert entities["/reward/total"]["step"].to_numpy()[0] == 1
-
-
 def test_series_are_the_episodes(entities, rollout):
     task = rollout.task
     for group, place in task.groups.items():
@@ -159,6 +138,10 @@ def test_series_are_the_episodes(entities, rollout):
     np.testing.assert_array_equal(scalars(entities["/action"]), rollout.action)
     assert names(entities["/action"]) == ["action_0 [-1, 1]"]
     np.testing.assert_array_equal(scalars(entities["/reward/total"])[:, 0], rollout.reward)
+    assert entities["/action"]["step"].to_numpy()[-1] == ROWS - 2
+    assert entities["/reward/total"]["step"].to_numpy()[0] == 1  # of the state that it led to
+    time = entity["time"].to_numpy(zero_copy_only=False) / np.timedelta64(10, "ms")
+    np.testing.assert_array_equal(time, np.arange(ROWS))
 
 
 def test_what_is_decoded(entities, rollout):
@@ -177,13 +160,13 @@ def test_what_is_decoded(entities, rollout):
     np.testing.assert_array_equal(position, decoded[:, :3].astype(np.float32))
     length = np.linalg.norm(decoded[:, 3:7], axis=1, keepdims=True)
     np.testing.assert_allclose(quaternion, decoded[:, 3:7] / length, atol=1e-6)
-    _, weight = poses(entities["/world/ghost/weight"])
-    half = (decoded[:, 13] - np.pi / 2) / 2
-    turned = np.stack((np.cos(half), 0 * half, 0 * half, np.sin(half)), axis=1)
-    x, y, z = (rotate(turned, np.tile(axis, (ROWS, 1))) for axis in np.eye(3))
-    for ours, axis in zip(np.eye(3), (x, y, z), strict=True):
-        there = rotate(weight, np.tile(ours, (ROWS, 1)))
-        np.testing.assert_allclose(there, rotate(quaternion, axis), atol=1e-5)
+    half = (decoded[:, 13] - np.pi / 2) / 2  # of the weight's turn about the vertical of the body
+    turned = Rotation.from_quat(np.column_stack((0 * half, 0 * half, np.sin(half), np.cos(half))))
+    there, body = (
+        Rotation.from_quat(poses(entities[f"/world/ghost/{name}"])[1], scalar_first=True)
+        for name in ("weight", "jitterbug")
+    )
+    np.testing.assert_allclose((there.inv() * body * turned).magnitude(), 0, atol=1e-5)
     apart = np.linalg.norm(decoded[:, :3] - qpos[:, :3], axis=1)
     bodies = entities["/error/bodies"]
     assert names(bodies)[0] == "jitterbug [mm]"
@@ -191,15 +174,6 @@ def test_what_is_decoded(entities, rollout):
     shown = values(entities["/world/ghost/jitterbug"], "Boxes3D:colors")[:, 0]
     expected = shades(apart).astype(np.uint32) @ (1 << np.array([24, 16, 8, 0], np.uint32))
     np.testing.assert_array_equal(shown, expected)  # not one for all times, which would win
-
-
-def test_an_encoder_that_keeps_all_gives_the_robot_back(unchanged):
-    found = read(unchanged)
-    place, turned = poses(found["/world/ghost/jitterbug"])
-    there, attitude = poses(found["/world/robot/jitterbug"])
-    up_to_sign = np.where((turned * attitude).sum(axis=1, keepdims=True) < 0, -1, 1)
-    np.testing.assert_allclose(place, there, atol=1e-5)
-    np.testing.assert_allclose(turned * up_to_sign, attitude, atol=1e-5)
 
 
 def test_principal_components():
@@ -260,8 +234,6 @@ def test_a_traversal_shows_what_each_unit_decodes_to(traversed, rollout):
         np.testing.assert_array_equal(series["traverse"].to_numpy(), np.arange(POINTS))
         most = encoder.task.feature_names[np.ptp(scaled, axis=0).argmax()]
         assert names(found[f"/traverse/unit_{unit}/most"])[0] == f"{most} [scaled]"
-        row = re.search(rf"^\| {unit} \|.*$", text(found["/traverse/summary"]), re.M)[0]
-        assert f"| {most} " in row
         position, quaternion = poses(found[f"/world/unit_{unit}/jitterbug"])
         np.testing.assert_allclose(position[:, 0], SPACING * (unit - 3.5), atol=1e-6)
         np.testing.assert_allclose(position[:, 2], decoded[:, 2], rtol=1e-6)
@@ -308,11 +280,8 @@ def test_a_robot_without_mujoco_shows_its_signals(short):
     rollout, found = short("Pendulum-v1", encoder="full")
     np.testing.assert_array_equal(scalars(found["/observation/obs"]), rollout.observation)
     assert names(found["/observation/obs"]) == ["obs_0", "obs_1", "obs_2"]
-    assert names(found["/action"]) == ["action_0 [-2, 2]"]
-    assert len(scalars(found["/latent/units"])) == 31
     assert scalars(found["/error/total"]).max() < 1e-6
     assert not any(path.startswith("/world") for path in found)
-    assert f"- return: {rollout.episode_return:.1f}" in text(found["/provenance"])
 
 
 SHAPES = """
@@ -399,21 +368,17 @@ def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(tmp_path):
     shown = read(inspect(str(tmp_path), out=tmp_path / "it.rrd"))
     assert f"# {tmp_path} at step 12,000" in text(shown["/provenance"])
     assert "/world/ghost/jitterbug" in shown
-    other = read(inspect(str(tmp_path), encoder="dae-8", out=tmp_path / "other.rrd"))
-    assert "- encoder: dae-8 (dae)" in text(other["/provenance"])
 
 
 @pytest.mark.parametrize(
     ("given", "named"),
     [
         ({}, "SOURCE"),
-        ({"source": "tests"}, "tests is no data set"),
         ({"source": FACE, "episode": 9}, "episode 9"),
         ({"source": FACE, "task": describe("move_to_pose")}, "move_to_pose"),
         ({"source": FACE, "traverse": True}, "--traverse"),
         ({"encoder": "dae-8"}, "--task"),
         ({"source": POSE, "encoder": DAE}, "dae-4"),
-        ({"source": FACE, "out": Path("README.md")}, "README.md"),
     ],
 )
 def test_mistakes(given, named):
@@ -438,10 +403,8 @@ def test_the_command_names_the_file_after_its_content(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told = jbrep("inspect", FACE, "--episode", 1, "--encoder", "dae-8").output
     path = "inspect/face_direction-data-sample-episode-1-dae-8.rrd"
-    assert told == f"encoder: dae-8, shipped\nopen it with:\nrerun {path}\n"
+    assert told.endswith(f"{path}\n")
     assert len(read(tmp_path / path)["/observation/position"]["step"]) == ROWS
-    told = jbrep("inspect", "--encoder", "dae-4", "--task", "move_to_pose", "--traverse").output
-    assert "inspect/move_to_pose-uniform-episode-0-dae-4-traverse.rrd\n" in told
 
 
 def test_the_viewer_is_rerun_itself(brief, tmp_path, monkeypatch):

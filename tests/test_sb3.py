@@ -10,7 +10,6 @@ from gymnasium import spaces
 from jbrep import JitterbugVecEnv
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
-from jbrep.envs.lanes import NonFiniteActionError
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 
@@ -89,24 +88,6 @@ def test_the_middle_of_an_episode_is_restored_to_the_same_bits(task):
                 np.testing.assert_array_equal(ours, theirs)
 
 
-@pytest.mark.parametrize(("lanes", "threads"), [(3, 1), (8, None)])
-def test_lane_i_has_the_episodes_of_seed_plus_i(lanes, threads):
-    def tape(environment, lane, drive):
-        rows = [environment.reset()[lane]]
-        for action in drive:
-            observation, reward, _, _ = environment.step(
-                np.repeat(action[None], environment.num_envs, 0)
-            )
-            rows.append(np.append(observation[lane], reward[lane]))
-        return np.concatenate(rows)
-
-    drive = actions(60, 1)[:, 0]
-    task = describe("move_in_direction", max_episode_steps=40)
-    alone = JitterbugVecEnv(task, 1, seed=10 + lanes - 1, num_threads=1)
-    among = JitterbugVecEnv(task, lanes, seed=10, num_threads=threads)
-    np.testing.assert_array_equal(tape(alone, 0, drive), tape(among, lanes - 1, drive))
-
-
 def test_the_encoder_sees_observations_in_physical_units_also_terminal_ones():
     plain, coded = JitterbugVecEnv(FACE, 2), JitterbugVecEnv(FACE, 2, encoder=Halves())
     assert coded.observation_space.shape == (8,)
@@ -160,24 +141,19 @@ def test_the_environment_gets_actions_within_its_bounds():
     np.testing.assert_array_equal(FACE.unscale_action(drawn), drawn)  # no bit is lost
 
 
-def test_mistakes_are_named():
-    with pytest.raises(InputError, match=r"unknown task 'fly': choose one of move_from_origin"):
-        JitterbugVecEnv("fly", 1)
-    with pytest.raises(InputError, match="the number of lanes is 0: it must be at least 1"):
-        JitterbugVecEnv("face_direction", 0)
-    with pytest.raises(InputError, match="is described with its time limit"):
-        JitterbugVecEnv(FACE, 1, max_episode_steps=7)
-    with pytest.raises(InputError, match="made for face_direction, not for Test/Cart-v0"):
-        JitterbugVecEnv(CART, 1, encoder=find("dae-8", FACE))
+class Liar(Halves):
+    latent_size = 7
 
-    class Liar(Halves):
-        latent_size = 7
 
-    with pytest.raises(InputError, match="latents of 8 numbers, but its latent_size is 7"):
-        JitterbugVecEnv("face_direction", 2, encoder=Liar())
-    environment = JitterbugVecEnv("face_direction", 2)
-    environment.reset()
-    with pytest.raises(InputError, match=r"shape \(2,\)"):
-        environment.step(np.zeros(2))
-    with pytest.raises(NonFiniteActionError, match="not finite"):
-        environment.step(np.full((2, 1), np.nan))
+@pytest.mark.parametrize(
+    ("task", "how", "named"),
+    [
+        ("face_direction", {"lanes": 0}, "at least 1"),
+        (FACE, {"lanes": 1, "max_episode_steps": 7}, "time limit"),
+        (CART, {"lanes": 1, "encoder": find("dae-8", FACE)}, "made for face_direction"),
+        (FACE, {"lanes": 2, "encoder": Liar()}, "latent_size is 7"),
+    ],
+)
+def test_mistakes_are_named(task, how, named):
+    with pytest.raises(InputError, match=named):
+        JitterbugVecEnv(task, **how)

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from command import jbrep, mistake
+from command import jbrep
 
 from jbrep.dataset import Dataset
 from jbrep.envs import describe
@@ -52,16 +52,3 @@ def test_it_plays_with_other_bodies_and_time_limits():
     assert (
         find_episode(SHIPPED, 2, describe("face_direction", max_episode_steps=20)).name == SHIPPED
     )
-
-
-@pytest.mark.parametrize(
-    ("command", "message"),
-    [
-        (("inspect", SHIPPED), "policy trained needs a --task"),
-        (("evaluate-policy", SHIPPED, "--task", "Pendulum-v1"), "no trained policy ships for"),
-        (("evaluate-policy", SHIPPED, "--encoder", "dae-8"), "which has its own encoder"),
-        (("evaluate-policy", "walks"), "constant, ornstein-uhlenbeck, trained"),
-    ],
-)
-def test_what_cannot_be_is_said_in_a_line(command, message):
-    assert message in mistake(*command)

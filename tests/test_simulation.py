@@ -132,16 +132,6 @@ def test_a_random_body_changes_nothing_else_that_is_drawn():
         assert plain.bit_generator.state == other.bit_generator.state
 
 
-def test_a_new_body_in_one_lane_leaves_the_others_alone():
-    undisturbed, disturbed = with_bodies(range(3), "random"), with_bodies(range(3), "random")
-    drive(undisturbed)
-    drive(disturbed)
-    disturbed.reset([1], [np.random.default_rng(77)])
-    one, other = drive(undisturbed), drive(disturbed)
-    np.testing.assert_array_equal(one[:, [0, 2]], other[:, [0, 2]])
-    np.testing.assert_array_equal(other[:, 1], drive(with_bodies([77], "random"))[:, 0])
-
-
 @pytest.mark.parametrize("body", [None, 7, "random"])
 def test_a_restored_simulation_continues_with_its_bodies(body):
     one = with_bodies(range(3), body)

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from jbrep.text import facts, slug, table, words
+from jbrep.text import slug, table, words
 
 HEADER = ("encoder", "error", "ratio", "worst feature")
 ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "motor_angle")]
@@ -31,13 +31,6 @@ def test_a_table_that_is_too_wide_is_cut_into_parts_that_fit_with_every_cell_onc
     assert len(parts) > 1
     for cell in (cell for row in (HEADER, *ROWS) for cell in row[1:]):
         assert shown.count(cell) == 1
-
-
-def test_facts_are_wrapped_below_themselves():
-    shown = facts({"task": "face_direction", "data": "word " * 20}, 40).splitlines()
-    assert shown[0] == "  task face_direction"
-    assert all(len(line) <= 40 for line in shown)
-    assert all(line.startswith(" " * 7) for line in shown[2:])
 
 
 def test_in_a_log_progress_is_a_line_now_and_then():
