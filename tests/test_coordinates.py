@@ -18,7 +18,6 @@ from jbrep.envs.description import describe
 from jbrep.envs.task import Feature
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError, Notice
-from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import TASKS
 
 TASK = TASKS["move_to_pose"].plain
@@ -147,34 +146,6 @@ def test_the_same_states_are_compared_in_the_nearest_numbers():
     smooth = continuous(task, jumps)
     np.testing.assert_allclose(smooth[:, place], path[:, place], atol=1e-12)
     np.testing.assert_allclose(smooth[:, angle], turning, atol=1e-9)
-
-
-def test_a_turned_robot_moves_alike_until_chaos_parts_them():
-    made, task = make_coordinates(TASK, "symmetry"), TASKS["move_to_pose"]
-    one, other = (Simulation(task, 3, 1) for _ in range(2))
-    for simulation in (one, other):
-        simulation.reset(range(3), [np.random.default_rng(seed) for seed in range(3)])
-    other.quarter_turn((0.4, -2.0))
-    random = np.random.default_rng(0)
-    for _ in range(50):
-        action = random.uniform(-1, 1, (3, 1))
-        one.step(action)
-        other.step(action)
-        codes = (made.forward(each.observe()) for each in (one, other))
-        np.testing.assert_allclose(*codes, atol=1e-6)
-        np.testing.assert_allclose(one.reward(), other.reward(), atol=1e-9)
-    assert np.abs(one.readings.qpos - other.readings.qpos).max() > 0.3
-
-
-def test_torch_gives_the_same_and_gradients():
-    made, rows = make_coordinates(TASK, "coordinates"), states(TASK)
-    tensor = torch.tensor(rows, requires_grad=True)
-    seen = made.forward(tensor)
-    np.testing.assert_allclose(seen.detach(), made.forward(rows))
-    back = made.inverse(seen)
-    np.testing.assert_allclose(back.detach(), made.inverse(made.forward(rows)))
-    back.sum().backward()
-    assert torch.isfinite(tensor.grad).all()
 
 
 @pytest.mark.parametrize(

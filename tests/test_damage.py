@@ -12,8 +12,6 @@ from jbrep.dataset.manifest import (
     MANIFEST,
     find_problems,
     open_shard,
-    read_manifest,
-    write_manifest,
 )
 from jbrep.errors import InputError
 
@@ -154,13 +152,3 @@ def test_shards_without_a_manifest_are_no_data_set(copied, collected):
             use(copied)
     with pytest.raises(InputError, match=f"has shards but no {MANIFEST}"):
         write_again(collected, copied)
-
-
-def test_another_version_of_the_format_is_named(copied):
-    manifest = read_manifest(copied)
-    text = manifest.text().replace('"format_version": 4', '"format_version": 3')
-    (copied / MANIFEST).write_text(text)
-    with pytest.raises(InputError, match="has version 3"):
-        Dataset(copied)
-    write_manifest(copied, manifest)
-    read_all(copied)

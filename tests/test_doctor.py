@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import PackageNotFoundError, packages_distributions, version
+from importlib.metadata import packages_distributions, version
 from itertools import chain
 from pathlib import Path
 
@@ -20,19 +20,6 @@ def told():
     """The command's exit code, and its text in one line."""
     result = jbrep("doctor")
     return result.exit_code, " ".join(result.output.split())
-
-
-def have(monkeypatch, **versions):
-    """Pretend that packages are of these versions, or missing."""
-
-    def pretended(name):
-        known = {key.replace("_", "-"): value for key, value in versions.items()}
-        found = known[name] if name in known else version(name)
-        if found is None:
-            raise PackageNotFoundError(name)
-        return found
-
-    monkeypatch.setattr(doctor, "version", pretended)
 
 
 @pytest.fixture
@@ -62,21 +49,6 @@ def test_a_module_is_known_by_the_extra_that_brings_it():
     modules = ("PIL", "sklearn", "rerun", "torch", "ray", "numpy", "fly")
     extras = ["render", "learn", "view", "learn", "cluster", None, None]
     assert [doctor.extra_with(module) for module in modules] == extras
-
-
-@pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize(
-    ("versions", "problem"),
-    [
-        ({"mujoco": "4.0.0"}, "core mujoco 4.0.0 (<4,>=3.17 is needed): pip"),
-        ({"h5py": None, "numpy": "1.26.4"}, "core numpy 1.26.4 (>=2 is needed), no h5py: pip"),
-    ],
-)
-def test_what_will_not_do_is_an_error(versions, problem, monkeypatch):
-    have(monkeypatch, **versions)
-    code, text = told()
-    assert code == 1
-    assert problem in text
 
 
 CORE_ALONE = """

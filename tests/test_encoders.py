@@ -147,18 +147,6 @@ def test_what_is_no_encoder_is_refused_and_nothing_in_it_is_run(encoder, tmp_pat
     assert not (tmp_path / "exploded").exists()
 
 
-def test_an_encoder_of_another_environment_or_other_features_is_refused(encoder):
-    encoder.check_task(TASK)
-    one = numbered(3)
-    assert one.feature_names == PENDULUM.feature_names  # as of every robot of three features
-    with pytest.raises(InputError, match=f"made for Pendulum-v1, not for {one.name}"):
-        make(task=PENDULUM).check_task(one)
-    renamed = PENDULUM.replace(features=(Feature("x"), Feature("y"), Feature("speed")))
-    with pytest.raises(InputError, match="dae-3 was made for other features of Pendulum-v1"):
-        make(task=PENDULUM).check_task(renamed)
-    make(task=PENDULUM).check_task(describe("Pendulum-v1"))  # with other arguments
-
-
 def test_what_needs_no_data_is_made_of_renamed_or_shifted_features():
     """Where what ships for the task was made for others."""
     first, *others = TASK.features

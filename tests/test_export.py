@@ -89,16 +89,6 @@ def test_minari_lists_it_opens_it_and_recovers_the_environment(dataset, tmp_path
     assert done.stdout == "jitterbug/face_direction/uniform-v0 EpisodeData\n"
 
 
-def test_parquet_files_come_together_or_not_at_all(dataset, tmp_path, monkeypatch):
-    def fail(*arguments, **keywords):
-        raise OSError("the disk is gone")
-
-    monkeypatch.setattr(pq, "write_table", fail)
-    with pytest.raises(InputError, match=r"can't write .*data\.parquet: the disk is gone"):
-        export(dataset, "parquet", tmp_path / "data.parquet")
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_table_belongs_to_the_file_of_its_episodes(dataset, tmp_path):
     path, beside = tmp_path / "data.parquet", tmp_path / "data-episodes.parquet"
     export(dataset, "parquet", path)

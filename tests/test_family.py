@@ -50,7 +50,7 @@ def test_relatives_learn_to_reconstruct(kind, data, tmp_path):
     assert 1 - np.square(back - rows).mean() / rows.var(axis=0).mean() > least
 
 
-@pytest.mark.parametrize("kind", ["ddae", "lld-vae", "forward", "deepmdp"])
+@pytest.mark.parametrize("kind", ["dae", "ddae", "lld-vae", "forward", "deepmdp"])
 def test_the_same_seed_gives_the_same_weights_also_after_a_resume(kind, data, tmp_path):
     one, other, half = (trainer(data, kind) for _ in range(3))
     list(one.epochs())
@@ -60,6 +60,7 @@ def test_the_same_seed_gives_the_same_weights_also_after_a_resume(kind, data, tm
     other.restore({}, tmp_path / "at")
     list(other.epochs())
     assert other.history == one.history
+    assert all(torch.equal(one.best[name], other.best[name]) for name in one.best)
     for name, parameter in one.objective.state_dict().items():
         assert torch.equal(other.objective.state_dict()[name], parameter)
 

@@ -88,36 +88,9 @@ def test_curves_are_the_medians_of_the_statistics(plots, found):
     assert bands[0].y1 == pytest.approx(max(group.agents[0].curve["p90"]))
 
 
-def test_a_representation_has_one_colour_in_all_figures(found):
-    """Also where the statistics leave out a representation that comes before it."""
-    fewer = of_runs([run for run in runs() if run.representation != "dae-8"])
-    for some in (found, fewer.replace(representations=[*FINAL])):
-        colours = {
-            line.get_color()
-            for plot in study_plots(some)
-            for axes in drawn(plot).axes
-            for line in axes.lines
-            if line.get_label().startswith("pca-4")
-            or (
-                plot.name == "every_run"
-                and "pca-4" in axes.get_title(loc="left")
-                and len(line.get_xdata()) == 6
-            )
-        }
-        assert colours == {"#D55E00"}
-
-
-def of_runs(some, played=IN_TRAINING):
-    return found_of(analyse(some), some, played)
-
-
-def difference_panel(found):
-    (plot,) = [plot for plot in study_plots(found) if plot.name == "differences"]
-    return drawn(plot).axes[0], plot.rows
-
-
 def test_differences_from_the_baseline_stand_with_their_intervals(found):
-    axes, rows = difference_panel(found)
+    (plot,) = [plot for plot in study_plots(found) if plot.name == "differences"]
+    axes, rows = drawn(plot).axes[0], plot.rows
     value, *ends = found.groups[0].comparisons[0].numbers["final_return_difference"]
     assert (rows[0]["difference"], rows[0]["tested_low"]) == (value, None)
     (thick,) = [line for line in axes.lines if line.get_linewidth() == 2][:1]
@@ -134,13 +107,6 @@ def test_limits_hold_what_is_near_and_not_what_is_far():
     assert fitting(returns, ends=[-420, np.nan, 9000])[0] == pytest.approx(-420, abs=20)
     assert fitting(returns, ends=[9000])[1] < 0
     assert fitting([0.2, 0.2]) == pytest.approx((-0.3, 0.7))
-
-
-def test_without_statistics_the_runs_are_drawn_all_the_same(found):
-    assert [plot.name for plot in study_plots(found.replace(groups=[], aggregates=[]))] == [
-        "every_run"
-    ]
-    assert study_plots(found.replace(groups=[], aggregates=[], runs=[])) == []
 
 
 def test_diagnostics_stand_against_final_returns(found):

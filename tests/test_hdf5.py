@@ -3,7 +3,7 @@
 import h5py
 import numpy as np
 import pytest
-from foreign import ROWS, STEPS, imported, not_imported, write_d4rl, write_robomimic
+from foreign import ROWS, imported, not_imported, write_d4rl, write_robomimic
 
 
 def test_a_file_of_d4rl(tmp_path):
@@ -14,17 +14,6 @@ def test_a_file_of_d4rl(tmp_path):
     names = ("--observations", "observations.0,infos/qpos", "--actions", "actions")
     _, wider = imported(tmp_path / "hopper_medium-v2.hdf5", *names, out="wider")
     assert wider.task.feature_names == ("observations_0", "qpos_0", "qpos_1", "qpos_2", "qpos_3")
-
-
-def test_what_came_after_each_action_keeps_the_last_steps(tmp_path):
-    after = np.stack([STEPS + 1, np.repeat(range(3), (10, 8, 7))], 1).astype(np.float32)
-    path = write_d4rl(tmp_path / "a.h5", next_observations=after)
-    _, data = imported(path)
-    assert data.episodes["length"].tolist() == [10, 8, 7]
-    assert data.episodes["terminated"].tolist() == [1, 0, 0]
-    assert data.episodes["final_observation"].tolist() == [[10, 0], [8, 1], [7, 2]]
-    _, few = imported(path, "--observations", "observations.0", out="few")
-    assert few.episodes["final_observation"].tolist() == [[10], [8], [7]]
 
 
 def test_a_file_of_robomimic(tmp_path):

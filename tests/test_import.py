@@ -17,11 +17,11 @@ import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from command import jbrep
 from gymnasium import spaces
 from small import flip_bit, settings
 
 from jbrep.collecting import collect
+from jbrep.collecting.derive import derive_view
 from jbrep.collecting.replay import repair, replay_problems
 from jbrep.dataset import Dataset, from_arrays
 from jbrep.dataset.formats import FORMATS, export, open_sources
@@ -202,31 +202,16 @@ def test_an_episode_may_have_ended_in_both_ways(to, tmp_path):
         assert each.episodes["truncated"].tolist() == [1, 1, 0]
 
 
-def test_what_is_hidden_or_rewarded_otherwise_goes_to_minari(collected, tmp_path, monkeypatch):
+def test_what_is_hidden_goes_to_minari(collected, tmp_path):
     """Beside the whole; without the environment, which shows more."""
-    (tmp_path / "mine.py").write_text(
-        "def reward(observations, actions):\n    return 9 + actions[:, 0]"
-    )
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("jbrep.envs.names._imported", [])
-    hide = ("--hide", "*velocity*")
-    assert jbrep("data", "derive", collected, *hide, "--out", "seen").exit_code == 0
-    reward = ("--reward", "mine:reward")
-    assert jbrep("data", "derive", collected, *reward, "--out", "rewarded").exit_code == 0
+    derive_view(collected, tmp_path / "seen", ["*velocity*"])
+    seen = Dataset(tmp_path / "seen")
     export(Dataset(collected), "minari", tmp_path / "out")
-    export(Dataset("seen"), "minari", tmp_path / "out")
-    export(Dataset("rewarded"), "minari", tmp_path / "own")
+    export(seen, "minari", tmp_path / "out")
     (hidden,) = (tmp_path / "out").glob("jitterbug/*without*/uniform-v0")
     assert "env_spec" not in json.loads((hidden / "data/metadata.json").read_text())
     assert import_data(str(hidden), tmp_path / "back") == "it names no environment"
-    np.testing.assert_array_equal(
-        Dataset(tmp_path / "back")["observation"], Dataset("seen")["observation"]
-    )
-    (own,) = (tmp_path / "own").glob("**/uniform-v0")
-    import_data(str(own), tmp_path / "again")
-    again = Dataset(tmp_path / "again")
-    np.testing.assert_array_equal(again["reward"], Dataset("rewarded")["reward"])
-    assert (again.task.name, again.task.reward_high) == (Dataset(collected).task.name, None)
+    np.testing.assert_array_equal(Dataset(tmp_path / "back")["observation"], seen["observation"])
 
 
 def d4rl(path, **changes):

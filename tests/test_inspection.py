@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 import rerun as rr
 from command import jbrep
-from made_up import write_checkpoint
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
-from small import ONE_EACH
 
 from jbrep.encoders import find
 from jbrep.envs import describe
@@ -23,10 +21,8 @@ from jbrep.inspection.blueprint import traversal_layout
 from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot, shapes
 from jbrep.inspection.scene import shades
-from jbrep.inspection.signals import principal_components
 from jbrep.inspection.subject import POINTS, SPACING, sweep
 from jbrep.play.sources import find_episode
-from jbrep.rl import Run
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
 DAE = "jbrep/encoders/shipped/face_direction/dae-4.safetensors"
@@ -174,19 +170,6 @@ def test_what_is_decoded(entities, rollout):
     shown = values(entities["/world/ghost/jitterbug"], "Boxes3D:colors")[:, 0]
     expected = shades(apart).astype(np.uint32) @ (1 << np.array([24, 16, 8, 0], np.uint32))
     np.testing.assert_array_equal(shown, expected)  # not one for all times, which would win
-
-
-def test_principal_components():
-    random = np.random.default_rng(0)
-    latent = random.normal(size=(200, 5)) * (0.1, 3, 0.1, 1, 0.1)
-    path = principal_components(latent)
-    np.testing.assert_allclose(np.corrcoef(path.T), np.eye(2), atol=1e-12)
-    assert path[:, 0].std() > path[:, 1].std() > 0.9
-    two = latent[:, [1, 3]]
-    apart = np.linalg.norm(two[1:] - two[:-1], axis=1)
-    kept = principal_components(two)
-    np.testing.assert_allclose(np.linalg.norm(kept[1:] - kept[:-1], axis=1), apart)
-    assert not principal_components(latent[:, :1])[:, 1].any()
 
 
 @pytest.mark.parametrize("recording", ["recorded", "traversed"])
@@ -356,18 +339,6 @@ def test_bodies_that_stand_still_have_one_pose_and_bare_ones_no_shape(folder):
     assert moving == {"a_b": 3, "bare": 3, "body_3": 1}
     assert "Mesh3D:vertex_positions" in found["/robot/a_b"]
     assert not any(":colors" in name for name in found["/robot/bare"])
-
-
-def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(tmp_path):
-    task = describe("face_direction", max_episode_steps=50)
-    write_checkpoint(
-        tmp_path,
-        Run.of(task, "a2c", encoder="dae-4", preset="paper", **ONE_EACH),
-        12_000,
-    )
-    shown = read(inspect(str(tmp_path), out=tmp_path / "it.rrd"))
-    assert f"# {tmp_path} at step 12,000" in text(shown["/provenance"])
-    assert "/world/ghost/jitterbug" in shown
 
 
 @pytest.mark.parametrize(

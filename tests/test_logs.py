@@ -260,12 +260,6 @@ def test_lists_in_a_table_and_integers_as_actions(tmp_path):
     _, data = imported(tmp_path / "a.parquet", "--actions", "pulse", "--episode", "trial")
     assert data.task.feature_names == ("observation_0", "observation_1")
     assert (data.task.action_low, data.task.action_high) == ((1000,), (1380,))
-    ragged = frame.with_columns(observation=polars.lit([1.0])).with_row_index("i")
-    frame = polars.concat([frame.with_row_index("i"), ragged], how="vertical_relaxed")
-    frame.write_parquet(tmp_path / "b.parquet")
-    names = ("--observations", "observation", "--actions", "pulse", "--episode", "trial")
-    told = not_imported(tmp_path / "b.parquet", *names)
-    assert all(word in told for word in ("b.parquet, row 40", "'observation'"))
 
 
 def test_several_logs_are_an_episode_each(tmp_path):
@@ -496,13 +490,6 @@ def test_lerobot_data_sets_that_are_not_whole_are_refused(tmp_path):
 def test_a_file_that_is_no_log_is_refused(name, content, problem, tmp_path):
     (tmp_path / name).write_bytes(content)
     assert problem in not_imported(tmp_path / name)
-
-
-def test_empty_lines_are_no_rows(tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text("# a\n\nt,x,u\n0,1,2\n\n1,2,3\n2,,3\n")
-    told = not_imported(path, "--time", "t", "--actions", "u")
-    assert "a.csv, line 7: 'x' is empty" in told
 
 
 def test_how_an_episode_ends_is_kept_where_its_last_time_is_there_twice(tmp_path):

@@ -6,7 +6,6 @@ from command import jbrep
 from small import contents, settings
 
 from jbrep.collecting import collect
-from jbrep.collecting.derive import derive
 from jbrep.collecting.policies import parse_policy
 from jbrep.collecting.replay import repair
 from jbrep.dataset import Dataset
@@ -68,9 +67,3 @@ def test_in_processes_and_extended(tmp_path):
     collect(some, tmp_path / "at once", num_threads=1)
     assert contents(tmp_path / "data") == contents(tmp_path / "at once")
     assert not list(find_problems(tmp_path / "data"))
-
-
-def test_other_tasks_are_derived_from_a_mixture(mixture, tmp_path):
-    derive(mixture, "move_to_pose", tmp_path / "derived", store_state=True)
-    collect(mixed("move_to_pose"), tmp_path / "collected")
-    assert contents(tmp_path / "derived") == contents(tmp_path / "collected")

@@ -10,6 +10,8 @@ import traceback
 import pytest
 from odd import FAILS, HARMLESS
 
+import jbrep.inspection
+import jbrep.rl  # noqa: F401  so that not every fork does
 from jbrep.cli import main
 from jbrep.dataset import Dataset
 

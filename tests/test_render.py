@@ -88,8 +88,7 @@ def test_a_gif_from_the_command_loops(tmp_path):
 
 
 @needs_egl
-@pytest.mark.parametrize("name", ["overhead", "tracking", "egocentric"])
-def test_a_frame_shows_what_mujoco_renders(name, episode):
+def test_a_frame_shows_what_mujoco_renders(episode):
     model = plain_model()
     data = mujoco.MjData(model)
     arrays = episode.motion.arrays
@@ -97,9 +96,9 @@ def test_a_frame_shows_what_mujoco_renders(name, episode):
     data.mocap_pos[:], data.mocap_quat[:] = arrays["mocap_pos"][40], arrays["mocap_quat"][40]
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, 120, 160) as renderer:
-        renderer.update_scene(data, name)
+        renderer.update_scene(data, "tracking")
         expected = renderer.render()
-    with Camera(name, 160, 120) as camera:
+    with Camera("tracking", 160, 120) as camera:
         film = Film([episode, episode], camera, Pace(fps=5, seconds=0.6))
         frame = np.asarray(list(film.frames())[2])
     below = band_height(120)
@@ -110,7 +109,7 @@ def test_a_frame_shows_what_mujoco_renders(name, episode):
 
 
 @needs_egl
-@pytest.mark.parametrize("task", ["Hopper-v5", "Reacher-v5", "dm_control/cheetah-run-v0"])
+@pytest.mark.parametrize("task", ["Reacher-v5", "dm_control/cheetah-run-v0"])
 def test_any_robot_of_mujoco_is_filmed(task):
     episode = find_episode("uniform", 0, describe(task, max_episode_steps=30))
     with Camera(None, *SIZE) as camera:

@@ -7,7 +7,6 @@ import tomllib
 import numpy as np
 import pytest
 import torch
-from command import jbrep
 from small import assert_same_files
 
 from jbrep.encoders import find
@@ -18,8 +17,8 @@ from jbrep.errors import InputError
 from jbrep.reporting.tables import read_tables
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.agent import evaluate, make_agent, make_env, statistics_of
-from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, read_evaluations, read_run
-from jbrep.rl.learner import Learner, preset_text, read_preset, usual_name
+from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, read_evaluations
+from jbrep.rl.learner import Learner, preset_text, read_preset
 from jbrep.rl.overrides import overridden
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_zip import load_zip
@@ -98,21 +97,6 @@ def test_what_a_setting_can_not_be(algorithm, settings, named, tmp_path):
     with pytest.raises(InputError, match=named):
         train(Run.of(**QUICK, algorithm=algorithm, overrides=settings), tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-def test_the_command_line_sets_them(tmp_path):
-    told = jbrep(
-        *("rl", "--task", "Pendulum-v1", "--preset", "modern", "--steps", 20),
-        *("--evaluation-episodes", 1, "--episode-steps", 20, "--normalize", "--out", tmp_path),
-        *("--set", "learning_rate=linear:3e-4", "--set", "net_arch=[8, 4]"),
-    )
-    assert told.exit_code == 0, told.output
-    settings = read_run(tmp_path).settings
-    overrides = {"learning_rate": "linear:3e-4", "net_arch": [8, 4], "normalize": True}
-    assert (settings.preset, settings.overrides) == ("modern", overrides)
-    chosen = settings.hyperparameters
-    assert (chosen.net_arch, chosen.normalize) == ((8, 4), True)
-    assert settings.learner == usual_name("sac-modern", overrides)
 
 
 def preset(algorithm, overrides):

@@ -32,7 +32,7 @@ def assert_same(one, other, lanes=slice(None), of=slice(None)):
         np.testing.assert_array_equal(a[:, lanes], b[:, of])
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e12])
+@pytest.mark.parametrize("value", [np.nan, 1e12])
 def test_a_lane_that_diverges_says_so_and_leaves_the_others_alone(value):
     def spoil(simulation):
         simulation.readings.qvel[1, 4] = value
