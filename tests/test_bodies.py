@@ -42,15 +42,6 @@ def test_a_number_gives_the_same_body_and_another_number_another():
         assert np.not_equal(getattr(one, name), getattr(other, name)).all()
 
 
-def test_materials_leave_the_geometry_as_it_is():
-    plain, made = draw(7), draw(7, materials=True)
-    assert plain != made
-    for name in ("knees", "feet", "weight", "weight_size"):
-        np.testing.assert_array_equal(getattr(plain, name), getattr(made, name))
-    assert not plain.densities.any()
-    assert plain.gear == 0
-
-
 @pytest.mark.parametrize(
     ("name", "spread", "off"),
     [

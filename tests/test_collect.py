@@ -5,14 +5,12 @@ import subprocess
 import sys
 import time
 
-import gymnasium
 import numpy as np
 import pytest
 import small
 from kills import COMMAND, kill_and_resume
 from small import contents, settings, write_again, written
 
-from jbrep import jitterbug
 from jbrep.collecting import collect, write_shards
 from jbrep.collecting.derive import derive
 from jbrep.collecting.replay import repair, replay_problems
@@ -21,7 +19,6 @@ from jbrep.dataset.manifest import find_problems, open_shard, read_manifest
 from jbrep.dataset.schema import episode_seed
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.jitterbug import environment_id
 from jbrep.records.storage import exclusive
 
 
@@ -32,25 +29,6 @@ def test_rows_are_the_episodes_of_a_random_policy(collected):
     np.testing.assert_array_equal(dataset["step"], np.tile(np.arange(1000), 5))
     assert abs(dataset["action"][:].mean()) < 0.05
     assert dataset["action"][:].std() == pytest.approx(1 / np.sqrt(3), rel=0.02)
-
-
-def test_an_episode_s_seed_starts_it_in_the_environments_too(collected):
-    dataset = Dataset(collected)
-    environment = gymnasium.make(environment_id("face_direction"))
-    for episode in (0, 3):
-        seed = int(dataset.episodes["seed"][episode])
-        observation, _ = environment.reset(seed=seed)
-        first = episode * 1000
-        np.testing.assert_array_equal(observation, dataset["observation"][first])
-        for step in range(20):
-            np.testing.assert_array_equal(observation, dataset["observation"][first + step])
-            observation, reward, *_ = environment.step(dataset["action"][first + step])
-            assert np.float32(reward) == dataset["reward"][first + step]
-        pytest.importorskip("dm_control")
-        physics = jitterbug.load("face_direction", seed=seed)
-        physics.reset()
-        qpos = dataset.episodes["initial_qpos"][episode]
-        np.testing.assert_array_equal(physics.physics.data.qpos, qpos)
 
 
 def test_neither_lanes_nor_threads_change_a_byte(tmp_path):

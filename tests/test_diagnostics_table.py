@@ -72,14 +72,7 @@ def test_encoders_of_one_representation_are_averaged():
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "task,sha256,forward\nt,s,1\n",
-        f"{KEY},forward\nt,r,s\n",
-        f"{KEY},forward\nt,r,s,nan\n",
-        f"{KEY},forward\nt,r,s,many\n",
-    ],
+    "text", ["", "task,sha256,forward\nt,s,1\n", f"{KEY},forward\nt,r,s\n", f"{KEY},x\nt,r,s,nan\n"]
 )
 def test_another_file_is_refused(text, tmp_path):
     (tmp_path / "t.csv").write_text(text)

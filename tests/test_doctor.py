@@ -7,40 +7,18 @@ from importlib.metadata import packages_distributions, version
 from itertools import chain
 from pathlib import Path
 
-import pytest
 from command import jbrep
-from conftest import needs_egl
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from jbrep import doctor
 
 
-def told():
-    """The command's exit code, and its text in one line."""
-    result = jbrep("doctor")
-    return result.exit_code, " ".join(result.output.split())
-
-
-@pytest.fixture
-def undrawn(monkeypatch):
-    """Without the seconds that trying OpenGL takes."""
+def test_every_extra_is_examined(monkeypatch):
     monkeypatch.setattr(doctor, "_opengl", lambda: "not tried")
-
-
-@needs_egl
-def test_it_draws_something_to_see_whether_it_can(monkeypatch):
-    assert ": render draws with it" in told()[1]
-    monkeypatch.setenv("MUJOCO_GL", "crayons")
-    code, text = told()
-    assert (code, "OpenGL rendering needs EGL" in text) == (0, True)
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_every_extra_is_examined():
     project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
     assert set(doctor.extras()) == {*project["optional-dependencies"]}
-    text = told()[1]
+    text = " ".join(jbrep("doctor").output.split())
     for name in ("numpy", "mujoco", "torch", "pillow"):
         assert f"{name} {version(name)}" in text
 

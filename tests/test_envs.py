@@ -107,19 +107,6 @@ def test_a_lane_that_diverges_starts_anew_alone():
     assert np.isfinite(info["final_obs"][1]).all()
 
 
-@needs_egl
-def test_frames():
-    environment = gymnasium.make(FACE, render_mode="rgb_array", width=160, height=120)
-    environment.reset(seed=0)
-    frame = environment.render()
-    assert frame.shape == (120, 160, 3)
-    assert frame.std() > 10
-    for _ in range(50):
-        environment.step(np.ones(1, np.float32))
-    assert np.abs(environment.render().astype(int) - frame).max() > 50
-    environment.close()
-
-
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Gymnasium's viewer
 def test_missing_opengl_is_said_in_one_line_and_all_else_works(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")

@@ -263,17 +263,6 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     assert change[0] == pytest.approx(expected, abs=1e-3)
 
 
-def test_units_mixed_or_scaled_do_not_change_how_well_the_next_is_read(held_out, coder):
-    mixed = np.random.default_rng(0).normal(size=(4, 4)) * [[9], [1], [1], [0.1]]
-    (layer,) = coder.encoder
-    weight, bias = ((mixed @ each).astype(np.float32) for each in (layer.weight, layer.bias))
-    turned = (layer._replace(weight=weight, bias=bias),)
-    other = Encoder(coder.header, coder.scaler, turned, coder.decoder)
-    both = (dynamics(judged(each, held_out)) for each in (coder, other))
-    for one, two in zip(*both, strict=True):
-        assert one == pytest.approx(two, abs=1e-3)
-
-
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
 def test_labels_and_numbers_that_cannot_be_judged(data):
     with pytest.raises(InputError, match="the label full is reserved for the observation itself"):

@@ -10,7 +10,7 @@ from made_up import drawn, found_of
 from PIL import Image
 
 from jbrep.reporting.figures import study_plots, write
-from jbrep.reporting.figures.panels import COLUMN, PAGE, PAPER, fitting
+from jbrep.reporting.figures.panels import COLUMN, PAGE, PAPER
 from jbrep.stats import RunCurve, analyse
 
 STEPS = np.arange(0, 50_001, 10_000)
@@ -97,16 +97,6 @@ def test_differences_from_the_baseline_stand_with_their_intervals(found):
     np.testing.assert_array_equal(thick.get_xdata(), ends)
     texts = [text.get_text() for text in axes.get_yticklabels()]
     assert texts == ["dae-8 - full", "pca-4 - full"]
-
-
-def test_limits_hold_what_is_near_and_not_what_is_far():
-    returns = [-400.0, -100.0, np.nan]
-    assert fitting(returns) == pytest.approx((-412, -88))
-    assert fitting(returns, near=[0]) == pytest.approx((-416, 16))
-    assert fitting(returns, near=[900]) == fitting(returns)
-    assert fitting(returns, ends=[-420, np.nan, 9000])[0] == pytest.approx(-420, abs=20)
-    assert fitting(returns, ends=[9000])[1] < 0
-    assert fitting([0.2, 0.2]) == pytest.approx((-0.3, 0.7))
 
 
 def test_diagnostics_stand_against_final_returns(found):

@@ -81,22 +81,6 @@ def test_a_function_may_take_the_options_of_another():
     )
 
 
-def test_help_is_the_docstrings():
-    text = " ".join(run("--help").output.split())
-    for line in (
-        "As long as --steps say. Options: --out PATH A folder for the film. [required]",
-        "--steps NUMBER In all. [required]",
-        "--back And home again, not with --steps 1.",
-        "--length FLOAT Of each [m]. [default: 0.5]",
-        "--gait [pace|trot] [default: what is usual]",
-        "--mass FLOAT Of the robot [kg]. [default: 1.0]",
-        "Example: jbrep walk --out x",
-    ):
-        assert line in text
-    assert "Args" not in text
-    assert "--watch" not in text
-
-
 @pytest.mark.parametrize(
     ("given", "told"),
     [

@@ -7,18 +7,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import rerun as rr
 from command import jbrep
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
 from jbrep.encoders import find
 from jbrep.envs import describe
-from jbrep.envs.physics import Motion
 from jbrep.errors import InputError
 from jbrep.inspection import inspect
-from jbrep.inspection.blueprint import traversal_layout
-from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot, shapes
 from jbrep.inspection.scene import shades
 from jbrep.inspection.subject import POINTS, SPACING, sweep
@@ -115,14 +111,6 @@ def test_poses_are_the_episodes(entities, rollout):
     target, turned = poses(entities["/world/surroundings/target"])
     np.testing.assert_allclose(target[0], motion.arrays["mocap_pos"][0, 0], atol=1e-7)
     np.testing.assert_allclose(turned[0], motion.arrays["mocap_quat"][0, 0], atol=1e-7)
-    model, data = motion.model, mujoco.MjData(motion.model)
-    for row in range(0, ROWS, 250):
-        motion.put(data, row)
-        mujoco.mj_kinematics(model, data)
-        for name in ("leg3_lower", "weight"):
-            there, attitude = poses(entities[f"/world/robot/{name}"])
-            np.testing.assert_allclose(there[row], data.body(name).xpos, atol=1e-7)
-            np.testing.assert_allclose(attitude[row], data.body(name).xquat, atol=3e-7)
 
 
 def test_series_are_the_episodes(entities, rollout):
@@ -170,17 +158,6 @@ def test_what_is_decoded(entities, rollout):
     shown = values(entities["/world/ghost/jitterbug"], "Boxes3D:colors")[:, 0]
     expected = shades(apart).astype(np.uint32) @ (1 << np.array([24, 16, 8, 0], np.uint32))
     np.testing.assert_array_equal(shown, expected)  # not one for all times, which would win
-
-
-@pytest.mark.parametrize("recording", ["recorded", "traversed"])
-def test_recordings_are_small_and_bring_their_layout(recording, request):
-    path = request.getfixturevalue(recording)
-    assert path.stat().st_size < 4e6
-    (layout,) = RrdReader(path).blueprints()
-    assert layout.application_id == "jbrep"
-    chunks = [columns(chunk) for chunk in RrdReader(path).stream(store=layout)]
-    name = "TimePanelBlueprint:play_state"
-    assert [each[name].to_pylist() for each in chunks if name in each] == [[[2]]]  # playing
 
 
 def identity(path):
@@ -247,9 +224,7 @@ def test_any_robot_of_mujoco_is_recorded(short):
         assert len(position) == rows
         np.testing.assert_allclose(position[-1], data.xpos[body], atol=1e-6)
         np.testing.assert_allclose(quaternion[-1], data.xquat[body], atol=1e-6)
-    action = found["/action"]
-    np.testing.assert_array_equal(scalars(action), rollout.action)
-    assert names(action)[-1] == f"action_{rollout.task.action_size - 1} [-1, 1]"
+    np.testing.assert_array_equal(scalars(found["/action"]), rollout.action)
     np.testing.assert_array_equal(scalars(found["/reward/total"])[:, 0], rollout.reward)
     end = found["/reward/total"]["time"].to_pylist()[-1].total_seconds()
     assert end == pytest.approx(len(rollout) * rollout.task.timestep)
@@ -320,25 +295,6 @@ def test_shapes_of_every_kind():
     apart = np.linalg.norm(corners[:, None] - expected, axis=2)
     np.testing.assert_allclose(apart.min(axis=0), 0, atol=1e-6)
     np.testing.assert_allclose(apart.min(axis=1), 0, atol=1e-6)
-    normals = np.array(mesh.vertex_normals.as_arrow_array().to_pylist())
-    outward = corners - expected.mean(axis=0)
-    assert ((normals * outward).sum(axis=1) > 0).all()
-
-
-def test_bodies_that_stand_still_have_one_pose_and_bare_ones_no_shape(folder):
-    model = mujoco.MjModel.from_xml_string(SHAPES)
-    robot, motion = Robot(model), Motion(model, {"qpos": np.tile(model.qpos0, (3, 1))})
-    motion.qpos[:, 0] = (0, 1, 2)
-    recording = Recording("it", "shapes")
-    times = [rr.TimeColumn("step", sequence=np.arange(3))]
-    robot.draw(recording, "robot", times, robot.poses(motion), [1, 2, 3])
-    recording.write(folder / "shapes.rrd", traversal_layout(1, None, np.zeros((1, 3))))
-    found = read(folder / "shapes.rrd")
-    paths = ("a_b", "bare", "body_3")
-    moving = {path: len(poses(found[f"/robot/{path}"])[0]) for path in paths}
-    assert moving == {"a_b": 3, "bare": 3, "body_3": 1}
-    assert "Mesh3D:vertex_positions" in found["/robot/a_b"]
-    assert not any(":colors" in name for name in found["/robot/bare"])
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Lanes over any environment: resets, ends, snapshots, and environments that fail."""
 
-import environments
 import gymnasium
 import numpy as np
 import pytest
@@ -153,12 +152,6 @@ def test_actions_have_as_many_numbers_as_the_task_s():
         lanes.step(np.full((2, 3), np.nan))
     with pytest.raises(InputError, match="the number of lanes is 0"):
         Lanes(SLEDGE, 0)
-
-
-def test_a_vector_entry_point_of_another_kind_is_not_used():
-    """The sledge's raises an error; such ones usually reset a lane at its next step."""
-    assert gymnasium.spec(SLEDGE.id).vector_entry_point is environments.refuse
-    assert len(Lanes(SLEDGE, 2).envs) == 2
 
 
 def test_actions_are_stepped_as_they_are_stored():

@@ -19,6 +19,7 @@ from foreign import (
     GYRO,
     PITCH,
     RATE,
+    TIMES,
     csv_rows,
     imported,
     lerobot_folder,
@@ -262,7 +263,7 @@ def test_lists_in_a_table_and_integers_as_actions(tmp_path):
     assert (data.task.action_low, data.task.action_high) == ((1000,), (1380,))
 
 
-def test_several_logs_are_an_episode_each(tmp_path):
+def test_several_logs_of_one_clock_are_an_episode_each(tmp_path):
     first = write_csv(tmp_path / "a.csv", csv_rows())
     second = write_csv(tmp_path / "b.csv", csv_rows())
     _, data = imported(first, second, *NAMED, "--length", "100")
@@ -270,17 +271,9 @@ def test_several_logs_are_an_episode_each(tmp_path):
     (tmp_path / "c.csv").symlink_to(first)
     said = mistake("data", "import", first, second, tmp_path / "c.csv", *NAMED, "--out", "no")
     assert "c.csv is given twice" in said
-
-
-def test_logs_of_other_clocks_are_not_joined(tmp_path):
-    first = write_csv(tmp_path / "a.csv", csv_rows())
-    second = write_csv(tmp_path / "b.csv", csv_rows())
-    slow = {name: [*cells] for name, cells in csv_rows().items()}
-    (time,) = [name for name in slow if name.startswith("time")]
-    slow[time] = [str(10 * float(each)) for each in slow[time]]
-    third = write_csv(tmp_path / "c.csv", slow)
-    told = not_imported(first, second, third, *NAMED)
-    assert all(word in told for word in ("c.csv", "timestep"))
+    slow = csv_rows(time={row: f"{10 * t:.5f}" for row, t in enumerate(TIMES)})
+    told = not_imported(first, write_csv(tmp_path / "slow.csv", slow), *NAMED)
+    assert all(word in told for word in ("slow.csv", "timestep"))
 
 
 def test_a_lerobot_data_set(tmp_path):

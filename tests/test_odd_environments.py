@@ -10,8 +10,8 @@ import traceback
 import pytest
 from odd import FAILS, HARMLESS
 
-import jbrep.inspection
-import jbrep.rl  # noqa: F401  so that not every fork does
+import jbrep.inspection.recording  # so that not every fork imports it, nor what trains
+import jbrep.rl.training  # noqa: F401
 from jbrep.cli import main
 from jbrep.dataset import Dataset
 

@@ -17,7 +17,7 @@ from jbrep.envs.physics import physics_of
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import plain_model
 from jbrep.play.film import Film, Pace
-from jbrep.play.pictures import Camera, add_caption, band_height, find_camera
+from jbrep.play.pictures import Camera, band_height, find_camera
 from jbrep.play.sources import find_episode
 
 import_modules(["environments"])
@@ -154,15 +154,6 @@ def test_speed_and_frames(pace, frames, last, episode, camera):
     film = Film([episode], camera, pace)
     assert (len(film), len(film.states), film.states[-1]) == (frames, frames, last)
     assert film.seconds == pytest.approx(10 / pace.speed)
-
-
-def test_a_caption_keeps_to_its_band_and_to_its_room():
-    for width, height in ((64, 64), (320, 240), (1280, 960)):
-        picture = Image.new("RGB", (width, height), "green")
-        add_caption(picture, "runs/a" * 50, "return 712    9.96 s")
-        pixels = np.asarray(picture)
-        assert (pixels[band_height(height) :] == (0, 128, 0)).all()
-        assert (pixels[: band_height(height)] != (0, 128, 0)).any(axis=2).all()
 
 
 @needs_egl

@@ -75,15 +75,9 @@ def test_messages_in_bursts(tmp_path):
 
 
 def test_work_out_of_measure_is_refused_with_the_rows_that_it_would_make(tmp_path):
-    for name, times in {
-        "a": (0, 1, 199_998, 199_999),
-        "b": (-1e308, 1e308, 1.5e308, 1.6e308),
-        "c": (0, 1, 2, 1e300),
-    }.items():
-        rows = {"t": times, **{f"x{i}": np.ones(4) for i in range(100)}, "u": (0, 1, 0, 1)}
-        path = write_csv(tmp_path / f"{name}.csv", rows)
-        told = not_imported(path, *NAMED, "--rate", "100")
-        assert "an episode of 4 rows" in told or "too far apart" in told
+    rows = {"t": (0, 1, 199_998, 199_999), **{f"x{i}": np.ones(4) for i in range(100)}}
+    path = write_csv(tmp_path / "a.csv", rows | {"u": (0, 1, 0, 1)})
+    assert "an episode of 4 rows" in not_imported(path, *NAMED, "--rate", "100")
     table = pa.table({"t": [-(2**63), 0, 2**63 - 1], "x": [0.0, 1, 2], "u": [0.0, 1, 2]})
     pq.write_table(table, tmp_path / "d.parquet")
     assert "too far apart" in not_imported(tmp_path / "d.parquet", *NAMED)
