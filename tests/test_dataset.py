@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 from command import jbrep
-from small import settings, write_again
+from small import brief, write_again
 
 from jbrep.collecting import collect
 from jbrep.dataset import Dataset, manifest
@@ -90,7 +90,7 @@ def test_features_and_observables_by_name(dataset):
 
 
 def test_an_array_of_a_column_is_the_reader_s_own(dataset, collected, tmp_path):
-    collect(settings(steps=1000), tmp_path / "one")
+    collect(brief(steps=100), tmp_path / "one")
     for data in (dataset, Dataset(tmp_path / "one")):
         values = np.array(data["reward"])
         assert values.flags.writeable

@@ -53,10 +53,6 @@ def panels_of(figure):
     return {axes.get_title(loc="left"): axes for axes in figure.axes}
 
 
-def values(plot, column, **where):
-    return [r[column] for r in plot.rows if all(r[name] == each for name, each in where.items())]
-
-
 def test_each_figure_is_written_as_pdf_and_png_beside_its_table(found, tmp_path):
     one = found.replace(groups=found.groups[:1], aggregates=[], runs=found.runs[:4])
     plots = {plot.name: plot for plot in study_plots(one)}

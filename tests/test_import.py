@@ -447,12 +447,6 @@ def test_nothing_in_an_npz_file_is_unpickled(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["bad.npz"]
 
 
-def test_a_gap_between_an_observation_and_the_next_is_noticed(tmp_path):
-    d4rl(tmp_path / "a.npz", observations=np.roll(arrays()["observations"], 1, axis=1))
-    with pytest.raises(InputError, match="episode 0 has a gap after step 0"):
-        import_data(str(tmp_path / "a.npz"), tmp_path / "data")
-
-
 def test_files_that_are_no_data_are_refused(tmp_path, minari_folder):
     for name in ("a.npz", "a.parquet", "a.pkl"):
         (tmp_path / name).write_bytes(b"nonsense" * 50)

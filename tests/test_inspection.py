@@ -50,10 +50,6 @@ def names(entity):
     return entity["SeriesLines:names"].to_pylist()[0]
 
 
-def text(entity):
-    return entity["TextDocument:text"].to_pylist()[0][0]
-
-
 def poses(entity):
     """Positions (n, 3) and quaternions (n, 4), w first."""
     turned = values(entity, "Transform3D:quaternion")[:, 0]

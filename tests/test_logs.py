@@ -122,16 +122,6 @@ def test_columns_that_come_at_their_own_rates_meet_on_one_clock(tmp_path):
     assert data.episode(0)["action"][-1] == 40
 
 
-def test_time_that_stands_or_goes_back(tmp_path):
-    time = [*range(10), 9, *range(20)]
-    rows = {"t": map(str, time), "x": map(str, range(31)), "u": ["0.5"] * 31}
-    path = write_csv(tmp_path / "a.csv", rows)
-    names = ("--observations", "x", "--actions", "u", "--time", "t", "--units", "t=ms")
-    _, data = imported(path, *names, "--length", "8")
-    assert data.episodes["length"].tolist() == [7, 1, 7, 7, 3]
-    assert data.task.timestep == 1e-3
-
-
 REWARD = """
 import numpy as np
 def upright(observations, actions):
@@ -478,6 +468,7 @@ def test_lerobot_data_sets_that_are_not_whole_are_refused(tmp_path):
         ("a.csv", b"1,2\n3,4\n", "line 1: a number"),
         ("a.csv", b"a,b\n\xff\xfe,3\n", "UTF-8"),
         *((f"a.{kind}", b"nonsense" * 20, "as a bag") for kind in ("bag", "mcap", "db3")),
+        ("a.hdf5", b"nonsense" * 20, "as an HDF5 file"),
     ],
 )
 def test_a_file_that_is_no_log_is_refused(name, content, problem, tmp_path):

@@ -125,10 +125,3 @@ def test_each_verdict_can_be_reached(analysis):
     assert verdicts(analysis, "dae-2") == [("supported", None)] * 3
     assert verdicts(analysis, "pca-1") == [("contradicted", None)]
     assert verdicts(analysis, "dae-1") == [("undecided", None)]  # but for the failed run, similar
-
-
-def test_a_baseline_that_ends_where_it_began_sets_nothing_to_reach():
-    worse = [make("full", seed, START - 50) for seed in range(3)]
-    (group,) = analyse(worse).groups
-    assert np.isnan([*group.thresholds.values()]).all()
-    assert group.labels[0].numbers["steps_to_50_percent"].tolist() == [None] * 3

@@ -70,11 +70,9 @@ def test_one_of_the_dm_control_suite():
     assert task.feature_names[2:4] == ("position_2", "velocity_0")
     lanes = Lanes(task.replace(max_episode_steps=3), 1)
     lanes.reset([0], [episode_seed(task, 2046, 0)])
-    most = r"seeds of 31 bits: .* be at most 2,046, with at most 1,048,576 episodes"
-    with pytest.raises(InputError, match=most):
-        episode_seed(task, 2047, 0)
-    with pytest.raises(InputError, match="takes seeds of 31 bits"):
-        episode_seed(task, 0, 1 << 20)
+    for root, number in ((2047, 0), (0, 1 << 20)):
+        with pytest.raises(InputError, match="seeds of 31 bits"):
+            episode_seed(task, root, number)
     few = {episode_seed(task, root, n) for root in (0, 1, 2046) for n in (0, 1, 2**20 - 1)}
     assert len(few) == 9
     assert max(few) < 2**31

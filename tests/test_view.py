@@ -64,15 +64,6 @@ def test_lanes_show_the_steps_before(task, seen):
     assert not lanes.num_active
 
 
-def test_a_lane_that_begins_anew_forgets():
-    lanes = Lanes(with_view(describe("Sledges/Sledge-v0"), history=2), 2)
-    first = lanes.reset([0, 1], [1, 2])
-    lanes.step(np.full((2, 3), 0.5))
-    again = lanes.reset([1], [2])
-    np.testing.assert_array_equal(again[1], first[1])
-    assert again[0, -1] == np.float32(0.5)
-
-
 @pytest.mark.parametrize("change", [{"history": 3}, {"domain": {"noise": 0.1}}])
 def test_a_step_that_is_lost_is_not_seen(change):
     broken = describe("Sledges/Broken-v0", {"how": "nan", "seed": 5}, 30, missing="skip", **change)
