@@ -289,7 +289,6 @@ def test_an_evaluation_is_one_file_and_repeats(data, tmp_path):
 
 def test_the_command_says_which_encoders_were_taken(collected, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("jbrep.evaluation.regression._STEPS", 2)
     save(find("pca-4", "face_direction").with_header(name="dae-4"), Path("dae-4"))
     chosen = ("--encoder", "dae-4", "./dae-4")
     assert jbrep("evaluate", *chosen, "--data", collected, "--out", "judged").exit_code == 0

@@ -34,15 +34,14 @@ HOPPER = describe("Hopper-v5")
 FAILING = CART.replace(arguments={"fail_seed": training_seed(0) + 3})
 
 
-SHORTER = {"n_steps": 16, "train_freq": 16, "learning_starts": 50, "gradient_steps": 4}
+SHORTER = {"n_steps": 16, "train_freq": 16, "gradient_steps": 4}
 SMALL = {"net_arch": [8], "learning_starts": 50, "batch_size": 16}
 
 
 def shorter(algorithm):
     """Shorter rollouts and fewer updates, where the algorithm has such settings."""
     known = ALGORITHMS[algorithm].presets["paper"].algorithm_kwargs
-    quick = {name: value for name, value in SHORTER.items() if name in known}
-    return {"net_arch": [16], **quick, **({"batch_size": 32} if "batch_size" in known else {})}
+    return {name: n for name, n in (SMALL | SHORTER).items() if name in {*known, "net_arch"}}
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
