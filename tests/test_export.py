@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -106,9 +105,10 @@ def test_a_table_belongs_to_the_file_of_its_episodes(dataset, tmp_path):
 
 
 def test_an_exported_file_ends_as_its_format_does(dataset, tmp_path):
-    for to, name in (("npz", "face"), ("npz", "face.parquet"), ("parquet", "")):
-        with pytest.raises(InputError, match=name):
-            export(dataset, to, tmp_path / name if name else Path())
+    wrong = [("npz", "face", "face"), ("npz", "face.parquet", "face.parquet"), ("npz", "/", "name")]
+    for to, name, named in wrong:
+        with pytest.raises(InputError, match=named):
+            export(dataset, to, tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 

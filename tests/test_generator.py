@@ -35,6 +35,7 @@ def walk(
     hide: Sequence[str] = (),
     **walk: Annotated[Any, Walk],
 ) -> int:
+    """Walk."""
     print({"out": out, "name": name, "back": back, "lower": lower, "hide": hide, **walk})
     return 3
 

@@ -84,8 +84,9 @@ def test_missing_cells_are_cut_or_held_and_counted(tmp_path):
     path, names = write_csv(tmp_path / "b.csv", turns), ("--actions", "u", "--length", "9")
     _, data = imported(path, *names, "--missing", "hold:1", out="turns")
     assert data["observation"][:].tolist() == [[0, 0], [1, 0], [1, 2], [3, 2], [3, 4]]
-    write_csv(path, turns | {"u": [0, 1, "", 3, 4, 5]})
-    assert "lacks its action at step 2" in not_imported(path, *names, "--missing", "hold:1")
+    for column, cells, place in (("x", ["", *range(5)], "0"), ("u", [0, 1, "", 3, 4, 5], "2")):
+        write_csv(path, turns | {column: cells})
+        assert f"at step {place}" in not_imported(path, *names, "--missing", "hold:1")
 
 
 def test_uneven_clocks_are_brought_to_an_even_one(tmp_path):

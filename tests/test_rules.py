@@ -55,6 +55,13 @@ def words(found):
     return [verdict.verdict for verdict in found]
 
 
+@pytest.mark.parametrize("bounds", [RETURNS, Bounds(0), Bounds(-np.inf, 1000)])
+def test_intervals_keep_to_what_is_possible(bounds):
+    for values in (np.array([1, 2, 900.0]), np.array([999, 998, 100.0]), np.array([0, 1000.0])):
+        mean, low, high = mean_within(values, bounds, 0.999)
+        assert bounds.low <= low < mean < high <= bounds.high
+
+
 def test_intervals_of_bounded_means_cover_the_truth():
     values = 1000 - np.random.default_rng(0).gamma(2, 60, (4000, 10))
     assert values.min() > 0
