@@ -105,10 +105,10 @@ class Liar:
 @pytest.mark.parametrize(
     ("task", "how", "named"),
     [
-        ("face_direction", {"lanes": 0}, "at least 1"),
-        (FACE, {"lanes": 1, "max_episode_steps": 7}, "time limit"),
-        (CART, {"lanes": 1, "encoder": find("dae-8", FACE)}, "made for face_direction"),
-        (FACE, {"lanes": 2, "encoder": Liar()}, "latent_size is 7"),
+        ("face_direction", {"num_envs": 0}, "at least 1"),
+        (FACE, {"num_envs": 1, "max_episode_steps": 7}, "time limit"),
+        (CART, {"num_envs": 1, "encoder": find("dae-8", FACE)}, "made for face_direction"),
+        (FACE, {"num_envs": 2, "encoder": Liar()}, "latent_size is 7"),
     ],
 )
 def test_mistakes_are_named(task, how, named):
