@@ -35,22 +35,11 @@ def many():
 
 def test_a_number_gives_the_same_body_and_another_number_another():
     one, same, other = draw(7, True), draw(7, True), draw(8, True)
-    assert one == same
+    assert one == same != other
     assert hash(one) == hash(same)
-    assert one != other
     for name in DRAWN:
         np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
         assert np.not_equal(getattr(one, name), getattr(other, name)).all()
-    assert repr(one) == "Body(number=7, materials=True)"
-
-
-def test_materials_leave_the_geometry_as_it_is():
-    plain, made = draw(7), draw(7, materials=True)
-    assert plain != made
-    for name in ("knees", "feet", "weight", "weight_size"):
-        np.testing.assert_array_equal(getattr(plain, name), getattr(made, name))
-    assert not plain.densities.any()
-    assert plain.gear == 0
 
 
 @pytest.mark.parametrize(
@@ -163,19 +152,6 @@ def test_densities_and_gear_are_the_materials():
     gained = made.body("jitterbug").mass[0] - plain.body("jitterbug").mass[0]
     assert gained == pytest.approx(sum(change * volume for change, volume in volumes.items()))
     assert made.actuator("motor").gear[0] == pytest.approx(0.00833 + body.gear)
-
-
-def test_a_bent_leg_lets_the_weight_pass():
-    """So that the fast model, which knows of the floor alone, moves like the plain one."""
-    model, data = at_rest(draw(7))
-    data.joint("leg2_shoulder").qpos[0] = 0.6
-    passed = 0
-    for data.joint("motor").qpos[0] in np.linspace(-np.pi, np.pi, 60):
-        mujoco.mj_forward(model, data)
-        weight, rod = model.geom("weight").id, model.geom("leg2_upper").id
-        passed += mujoco.mj_geomDistance(model, data, weight, rod, 1, None) < 0
-        assert (data.contact.geom == model.geom("floor").id).any(axis=1).all()
-    assert passed
 
 
 def test_bodies_that_exist_and_others():

@@ -1,6 +1,5 @@
 """Policies as functions of observations: they act as the runs that they were taken from."""
 
-import re
 from itertools import cycle
 from pathlib import Path
 
@@ -12,13 +11,11 @@ import jbrep
 from jbrep.envs.description import describe
 from jbrep.envs.lanes import Lanes
 from jbrep.errors import InputError
-from jbrep.records import container
 from jbrep.rl import Run, train
 from jbrep.rl.agent import acting
 from jbrep.rl.controller import Controller, load_policy
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.policy import build
-from jbrep.rl.policy_file import find_shipped
 from jbrep.rl.presets import ALGORITHMS
 
 TASK = describe("move_to_pose", max_episode_steps=200)
@@ -91,23 +88,6 @@ def test_it_holds_actions_and_begins_again(tmp_path):
     assert np.abs(controller(rows[0])).max() <= 1
 
 
-def test_several_robots_at_once_are_like_one_after_the_other():
-    trained = randomised("sac", "symmetry")
-    rows = np.random.default_rng(0).normal(size=(3, TASK.size))
-    one_by_one = np.array([controller_of(trained)(row) for row in rows])
-    np.testing.assert_allclose(controller_of(trained)(rows), one_by_one, atol=1e-6)
-    assert one_by_one.std() > 0.01
-
-
-def test_units_of_the_actuators_are_those_of_the_task():
-    """Pendulum's torque is from -2 to 2 N m."""
-    task = describe("Pendulum-v1", max_episode_steps=50)
-    trained = randomised("sac", "full", task)
-    worst, spread = difference_over_an_episode(trained, controller_of(trained), 50)
-    assert worst < 4e-6
-    assert spread > 1e-3
-
-
 SEEN = [0.0, 1.0, 0.0]
 
 
@@ -124,9 +104,6 @@ def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
         load_policy(tmp_path / "own")
     train(Run.of(task, "a2c", **quick), tmp_path / "full")
     assert load_policy(tmp_path / "full/policy.zip")(SEEN) == load_policy(tmp_path / "full")(SEEN)
-    shipped = find_shipped(describe("face_direction"))
-    controller = load_policy(shipped)
-    assert repr(controller) == "Controller(face_direction: 16 numbers to 1, symmetry)"
 
 
 @pytest.mark.parametrize("history", [1, 2])
@@ -137,43 +114,24 @@ def test_what_is_refused_changes_nothing(history):
     encoder = run.find_encoder()
     trained = build(run.settings(encoder), encoder, Path("here"))
     controller, other = controller_of(trained), controller_of(trained)
-    takes = "the policy takes 2 numbers, of obs_1, obs_2; or a row of them for each robot"
     refused = [
-        ([0.3], takes),
-        ([0.3] * (2 * history + 2), takes),  # of which it would take the first two
-        (0.3, takes),
-        ([0.1, np.nan], "obs_2 is not finite: the policy takes finite numbers"),
+        ([0.3], "takes 2 numbers"),
+        ([0.3] * (2 * history + 2), "takes 2 numbers"),  # of which it would take the first two
+        ({"obs_1": 0.1, "obs_2": 0.2}, "dict"),
+        ([0.1, np.nan], "obs_2"),
     ]
-    several = ([[0.1, 0.2]] * 3, "of shape (3, 2) after others of (2,): give the same robots, or")
+    several = [[0.1, 0.2]] * 3
     for step in range(4):
-        for wrong, why in [*refused, several] if step else refused:
-            with pytest.raises(InputError, match=re.escape(why)):
+        for wrong, why in [*refused, (several, r"\(3, 2\)")] if step else refused:
+            with pytest.raises(InputError, match=why):
                 controller(wrong)
         np.testing.assert_array_equal(controller([0.1 * step, 0.2]), other([0.1 * step, 0.2]))
     controller.reset()
-    assert controller(several[0]).shape == (3, 1)
+    assert controller(several).shape == (3, 1)
 
 
-def test_what_a_policy_lacks_is_named(tmp_path):
-    shipped = find_shipped(describe("face_direction"))
-    tensors, header = container.read(shipped, "policy")
-    del tensors["policy.mu.bias"]
-    path = tmp_path / "policy.safetensors"
-    container.write(path, tensors, header)
-    with pytest.raises(InputError, match=r"doesn't fit the run's settings: .*mu"):
-        load_policy(path)
-
-
-def test_what_it_cannot_act_on_is_refused():
+def test_an_action_that_is_not_finite_is_refused():
     controller = controller_of(randomised("td3", "full"))
-    with pytest.raises(InputError, match=f"the policy takes {TASK.size} numbers, of position_x, "):
-        controller([0.0])
-    one_array = rf"is a dict: the policy takes {TASK.size} numbers.*in one array, as gymnasium"
-    with pytest.raises(InputError, match=one_array):
-        controller({"position": np.zeros(TASK.size)})
-    with (
-        np.errstate(all="ignore"),
-        pytest.raises(InputError, match="the policy's action is not finite"),
-    ):
+    with np.errstate(all="ignore"), pytest.raises(InputError, match="action is not finite"):
         controller(np.full(TASK.size, 1e38))
     assert controller(np.zeros(TASK.size)).shape == (TASK.action_size,)  # there is none to hold

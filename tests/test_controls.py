@@ -6,7 +6,7 @@ from sklearn.decomposition import PCA
 
 from jbrep.encoders.layers import run
 from jbrep.methods.controls import Random
-from jbrep.methods.linear import linear_code, principal_code
+from jbrep.methods.linear import principal_code
 
 
 def projection(data, latent, seed):
@@ -39,14 +39,6 @@ def test_pca_is_scikit_learns_and_loses_the_smallest_variances(data, rows, laten
     assert ours == pytest.approx(np.mean((reference - rows) ** 2), rel=1e-4)
     dropped = np.linalg.eigvalsh(data.moments.covariance)[: 16 - latent]
     assert ours == pytest.approx(dropped.sum() / 16, rel=1e-4)
-
-
-def test_no_linear_code_beats_principal_code(data, rows):
-    best = error(principal_code(data, 6), rows)
-    for seed in range(20):
-        assert error(projection(data, 6, seed), rows) > best
-        weight = np.random.default_rng(seed).normal(size=(6, 16))
-        assert error(linear_code(weight, data.moments), rows) > best
 
 
 def test_a_random_projection_is_orthonormal_and_its_decoder_the_best(data, rows):

@@ -117,39 +117,6 @@ def test_the_best_epoch_is_that_of_the_lowest_training_loss():
         assert torch.equal(it.best[name], value)
 
 
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_a_checkpoint_resumes_to_the_same_weights(architecture, tmp_path):
-    whole = trained(architecture=architecture, epochs=5)
-    first = trainer(architecture=architecture, epochs=5)
-    steps = first.epochs()
-    next(steps), next(steps)
-    steps.close()
-    first.save({"seed": 0}, tmp_path / "at")
-    second = trainer(architecture=architecture, epochs=5)
-    second.restore({"seed": 0}, tmp_path / "at")
-    assert len(second.history) == 2
-    list(second.epochs())
-    assert torch.equal(weights(whole), weights(second))
-    assert second.history == whole.history
-    assert all(torch.equal(whole.best[name], second.best[name]) for name in whole.best)
-
-
-@pytest.mark.parametrize(
-    ("settings", "named"),
-    [
-        ({"architecture": "wide"}, "unknown architecture"),
-        ({"batch_size": 0}, "batch_size"),
-        ({"epochs": -1}, "epochs"),
-        ({"learning_rate": np.nan}, "learning_rate"),
-        ({"noise": np.inf}, "noise"),
-        ({"latent": None}, "latent"),
-    ],
-)
-def test_mistakes_are_named(settings, named):
-    with pytest.raises(InputError, match=named):
-        DAE.of({"latent": 4, **settings})
-
-
 def test_losses_that_overflow_end_the_training_and_leave_the_best():
     it = trainer(noise=1e38, architecture="deep", batch_size=600)
     with pytest.raises(InputError, match=r"diverged in epoch 1, .*, or less noise if"):

@@ -1,17 +1,16 @@
 """Reading: columns over shards, splits, scaling, batches, and tools that know nothing of jbrep."""
 
 import json
-import pickle
 from itertools import accumulate
 
 import h5py
 import numpy as np
 import pytest
 from command import jbrep
-from small import settings, write_again
+from small import brief, write_again
 
 from jbrep.collecting import collect
-from jbrep.dataset import Dataset, Scaler, manifest
+from jbrep.dataset import Dataset, manifest
 from jbrep.dataset.columns import Column
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
@@ -37,24 +36,10 @@ def column(parts):
 @pytest.mark.parametrize(
     "key",
     [
-        0,
-        -1,
-        slice(None),
-        slice(1, 3),
-        slice(2, 9),
-        slice(4, 4),
-        slice(-3, None),
-        slice(11, 2, -2),
-        np.array([0, 11, 4, 4, -2]),
-        np.array([], dtype=int),
-        np.array([[1, 5], [11, 0]]),
-        np.arange(12) % 3 == 0,
-        np.zeros(12, dtype=bool),
-        (5, 1),
-        (slice(3, 8), 2),
-        (slice(None), slice(1, None)),
-        (np.array([7, 0]), 0),
-        (np.array([[1, 5], [11, 0]]), 2),
+        *(0, -1, slice(None), slice(2, 9), slice(4, 4), slice(-3, None), slice(11, 2, -2)),
+        *(np.array([0, 11, 4, 4, -2]), np.array([], dtype=int), np.array([[1, 5], [11, 0]])),
+        *(np.arange(12) % 3 == 0, np.zeros(12, dtype=bool)),
+        *((5, 1), (slice(3, 8), 2), (slice(None), slice(1, None)), (np.array([7, 0]), 0)),
     ],
     ids=str,
 )
@@ -77,15 +62,12 @@ def test_a_column_as_an_array(column, parts):
     for dtype in (np.uint8, np.int8, np.int64):
         np.testing.assert_array_equal(column[np.array([2, 1], dtype)], whole[[2, 1]])
     assert column[()].shape == whole[()].shape == (12, 3)
-    with pytest.raises(IndexError, match="only the first axis can be indexed by an array"):
-        column[[0, 1], [0, 1]]
-    with pytest.raises(IndexError, match="a slice or a mask"):
-        column["motor"]
-    for key in (12, -13, [3, 12]):
-        with pytest.raises(IndexError, match="there are 12"):
-            column[key]
-    with pytest.raises(IndexError, match="the mask has shape"):
-        column[np.ones(5, dtype=bool)]
+
+
+@pytest.mark.parametrize("key", [12, -13, [3, 12], "motor", ([0, 1], [0, 1]), np.ones(5, bool)])
+def test_what_is_no_index_of_a_column(key, column):
+    with pytest.raises(IndexError):
+        column[key]
 
 
 def test_a_slice_within_a_shard_is_a_view_of_the_file(dataset):
@@ -108,16 +90,11 @@ def test_features_and_observables_by_name(dataset):
 
 
 def test_an_array_of_a_column_is_the_reader_s_own(dataset, collected, tmp_path):
-    collect(settings(steps=1000), tmp_path / "one")
+    collect(brief(steps=100), tmp_path / "one")
     for data in (dataset, Dataset(tmp_path / "one")):
         values = np.array(data["reward"])
         assert values.flags.writeable
         assert isinstance(data["reward"][5], np.float32)
-
-
-def test_another_process_opens_it_anew(dataset):
-    again = pickle.loads(pickle.dumps(dataset))
-    np.testing.assert_array_equal(again["reward"], dataset["reward"])
 
 
 def test_episodes_have_columns_of_their_own(dataset):
@@ -137,7 +114,6 @@ def test_an_episode_is_its_rows_and_what_is_stored_once_for_it(dataset):
         np.testing.assert_array_equal(episode[name], dataset[name][3000:4000])
     assert episode.record["seed"] == 4 * 2**32 + 3
     np.testing.assert_array_equal(episode.record["initial_qpos"], dataset["qpos"][3000])
-    assert repr(episode).startswith("Episode(3 of ")
     for number in (5, -1):
         with pytest.raises(InputError, match=f"no episode {number}: it has 5, numbered from 0"):
             dataset.episode(number)
@@ -152,29 +128,8 @@ def test_the_split_is_by_episode_and_seeded(dataset):
     np.testing.assert_array_equal(test, dataset.split().test)
     assert len({tuple(np.unique(episode[dataset.split(seed=s).test])) for s in range(20)}) > 1
     assert len(np.unique(episode[dataset.split(test=0.99).test])) == 4
-    for share in (0, 1, -0.2):
-        with pytest.raises(InputError, match="must be between 0 and 1"):
-            dataset.split(test=share)
-
-
-def test_scaling_is_fitted_on_the_rows_that_are_given(dataset):
-    train, test = dataset.split()
-    scaler = dataset.fit_scaler(train)
-    observation = dataset["observation"][:]
-    scaled = scaler.scale(observation[train])
-    np.testing.assert_allclose(scaled.min(axis=0), -1, atol=1e-5)
-    np.testing.assert_allclose(scaled.max(axis=0), 1, atol=1e-5)
-    assert np.abs(scaler.scale(observation[test])).max() > 1
-    back = scaler.unscale(scaler.scale(observation))
-    np.testing.assert_allclose(back, observation, atol=2e-5)
-    assert scaled.dtype == np.float32
-
-
-def test_a_feature_that_never_changes_is_scaled_to_0():
-    low = np.array([2, -1], np.float32)
-    scaler = Scaler(low, np.array([2, 1], np.float32))
-    np.testing.assert_array_equal(scaler.scale(low[None]), [[0, -1]])
-    np.testing.assert_array_equal(scaler.unscale(np.array([[0, 1]], np.float32)), [[2, 1]])
+    with pytest.raises(InputError, match="between 0 and 1"):
+        dataset.split(test=1)
 
 
 def test_a_reader_sees_whole_shards_while_a_collector_writes(collected, tmp_path):
@@ -191,28 +146,16 @@ def test_a_reader_sees_whole_shards_while_a_collector_writes(collected, tmp_path
     assert Dataset(tmp_path / "growing").manifest.complete
 
 
-def test_the_card_tells_what_is_there(dataset, collected):
-    text = dataset.card()
-    for part in ("16 features, 1 action", "uniform", "rows        5,000", "5 shards"):
-        assert part in text
-    low, median, high = np.percentile(dataset.episodes["return"], (10, 50, 90))
-    assert f"median {median:,.1f} [10 % {low:,.1f}, 90 % {high:,.1f}]" in " ".join(text.split())
-    speed = dataset["motor_velocity"][:].astype(float)
-    line = next(line for line in text.splitlines() if "motor_velocity" in line).split()
-    assert [float(word) for word in line[2:6]] == pytest.approx(
-        [speed.min(), speed.mean(), speed.max(), speed.std()], rel=1e-3
-    )
-    assert dataset.fingerprint in text
-
-
 def test_a_data_set_as_json(dataset):
     about = json.loads(jbrep("data", "info", dataset.folder, "--json").stdout)
     assert (about["task"], about["rows"], about["episodes"]) == ("face_direction", 5000, 5)
     assert about["return"]["mean"] == pytest.approx(dataset.episodes["return"].mean())
-    speed = about["features"][14]
-    assert (speed["feature"], speed["unit"]) == ("motor_velocity", "rad/s")
-    assert speed["nominal"] == [-180, 180]
-    assert speed["max"] == dataset["motor_velocity"][:].max()
+    shown, speed = about["features"][14], dataset["motor_velocity"][:].astype(float)
+    assert (shown["feature"], shown["unit"]) == ("motor_velocity", "rad/s")
+    assert shown["nominal"] == [-180, 180]
+    of_all = [speed.min(), speed.mean(), speed.max(), speed.std()]
+    assert [shown[n] for n in ("min", "mean", "max", "std")] == pytest.approx(of_all, rel=1e-3)
+    assert "motor_velocity" in dataset.card()
 
 
 def test_an_unfinished_data_set_is_called_so(collected, tmp_path):
@@ -237,7 +180,5 @@ def test_a_shard_is_flat_columns_that_any_hdf5_tool_opens(collected):
         assert file["episodes/seed"][:].tolist() == [4 * 2**32 + 2]
 
 
-@pytest.mark.parametrize("task", ["move_from_origin", "move_to_pose"])
-def test_the_samples_are_verified(task):
-    told = jbrep("data", "verify", f"data/sample/{task}", "--replay", 1)
-    assert (told.exit_code, "no problems in 4,000 rows, 1 shard" in told.output) == (0, True)
+def test_a_sample_is_verified():
+    assert jbrep("data", "verify", "data/sample/move_to_pose", "--replay", 1).exit_code == 0

@@ -87,18 +87,6 @@ def test_an_episode_ends_by_time_alone_after_1000_steps(task):
     assert steps[-1].discount == 1.0
 
 
-def test_equal_seeds_give_equal_episodes_and_others_differ(task):
-    def tape(seed):
-        environment = load(task, task_kwargs={"random": seed})
-        return [
-            np.concatenate([*step.observation.values(), [step.reward or 0]])
-            for step in episodes(environment, steps=30)
-        ]
-
-    np.testing.assert_array_equal(tape(3), tape(3))
-    assert not np.array_equal(tape(3)[0], tape(4)[0])
-
-
 def test_no_feature_is_constant(task):
     some = episodes(load(task), count=2, steps=60)
     steps = [np.concatenate(list(step.observation.values())) for step in some]
@@ -112,12 +100,6 @@ def test_observations_share_no_memory(task):
     arrays = [*one.values(), *other.values()]
     for i, array in enumerate(arrays):
         assert not any(np.may_share_memory(array, b) for b in arrays[i + 1 :])
-
-
-def test_a_generator_may_be_passed(task):
-    random = np.random.RandomState(7)
-    environment = load(task, task_kwargs={"random": random})
-    assert environment.task.random is random
 
 
 def test_every_lane_has_the_same_episode_bit_for_bit(task):

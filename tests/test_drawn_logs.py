@@ -7,12 +7,12 @@ from foreign import imported
 
 from jbrep.dataset import Layout, from_table
 
-COUNTS = {"text": 60, "bag": 12}
+COUNTS = {"text": 40, "bag": 9}
 
 
 @pytest.mark.parametrize("form", FILES)
 def test_files_are_read_back(form, tmp_path):
-    for seed in range(COUNTS.get(form, 10)):
+    for seed in range(COUNTS.get(form, 6)):
         random = np.random.default_rng(seed)
         truth, folder = Truth.drawn(random), tmp_path / str(seed)
         folder.mkdir()
@@ -22,7 +22,7 @@ def test_files_are_read_back(form, tmp_path):
 
 
 def test_frames_are_read_back(tmp_path):
-    for seed in range(25):
+    for seed in range(12):
         random = np.random.default_rng(seed)
         truth = Truth.drawn(random)
         names = {"observations": tuple(truth.features), "actions": tuple(truth.commands)}

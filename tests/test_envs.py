@@ -31,12 +31,6 @@ def test_the_ids():
     ]
 
 
-def test_importing_jbrep_after_gymnasium_registers_them():
-    code = f"import gymnasium, jbrep; print(gymnasium.spec('{FACE}').max_episode_steps)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "1000\n"
-
-
 @pytest.mark.filterwarnings("ignore:.*-?infinity. This is probably too")  # no state is bounded
 @pytest.mark.parametrize("env_id", [FACE, IDS[-1]])
 def test_checkers(env_id):
@@ -113,19 +107,6 @@ def test_a_lane_that_diverges_starts_anew_alone():
     assert np.isfinite(info["final_obs"][1]).all()
 
 
-@needs_egl
-def test_frames():
-    environment = gymnasium.make(FACE, render_mode="rgb_array", width=160, height=120)
-    environment.reset(seed=0)
-    frame = environment.render()
-    assert frame.shape == (120, 160, 3)
-    assert frame.std() > 10
-    for _ in range(50):
-        environment.step(np.ones(1, np.float32))
-    assert np.abs(environment.render().astype(int) - frame).max() > 50
-    environment.close()
-
-
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Gymnasium's viewer
 def test_missing_opengl_is_said_in_one_line_and_all_else_works(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
@@ -138,9 +119,8 @@ def test_missing_opengl_is_said_in_one_line_and_all_else_works(monkeypatch):
 
 def test_mistakes_are_named():
     next_step = gymnasium.vector.AutoresetMode.NEXT_STEP
-    for name, value in (("dtype", "float16"), ("autoreset_mode", next_step)):
-        assert str(value) in refused(lambda: gymnasium.make_vec(FACE, **{name: value}))  # noqa: B023
-    assert "lanes" in refused(lambda: gymnasium.make_vec(FACE, num_envs=0))
+    assert str(next_step) in refused(lambda: gymnasium.make_vec(FACE, autoreset_mode=next_step))
+    assert "side" in refused(lambda: gymnasium.make(FACE, camera="side"))
     many = gymnasium.make_vec(FACE, num_envs=2)
     assert "3 seeds for 2 lanes" in refused(lambda: many.reset(seed=[1, 2, 3]))
     many.reset()
@@ -159,31 +139,21 @@ def without_a_display(code):
 
 
 @needs_egl
-def test_frames_need_neither_a_display_nor_a_setting():
+def test_frames_need_neither_a_display_nor_a_setting_and_triton_can_be_imported_after_them():
+    """Torch does so with its first optimiser; where Mesa renders, the process crashed."""
+    pytest.importorskip("triton")
     done = without_a_display(
         f"env = gymnasium.make('{FACE}', render_mode='rgb_array', width=64, height=48)\n"
-        "env.reset(seed=0)\nprint(env.render().shape)\nenv.close()"
+        "env.reset(seed=0)\nprint(env.render().shape)\nimport triton"
     )
+    assert done.returncode == 0, done.stderr
     assert done.stdout == "(48, 64, 3)\n", done.stderr
 
 
 def test_a_window_without_a_display_is_refused_in_one_line():
-    with pytest.raises(InputError, match="unknown camera 'side': choose one of overhead"):
-        gymnasium.make(FACE, camera="side")
     done = without_a_display(f"gymnasium.make('{FACE}', render_mode='human')")
     assert done.returncode == 1  # an abort of the process has another
     assert "jbrep.errors.InputError: render_mode 'human'" in done.stderr.splitlines()[-1]
-
-
-@needs_egl
-def test_triton_can_be_imported_after_rendering():
-    """Torch does so with its first optimiser; where Mesa renders, the process crashed."""
-    pytest.importorskip("triton")
-    done = without_a_display(
-        f"env = gymnasium.make('{FACE}', render_mode='rgb_array')\n"
-        "env.reset(); env.render()\nimport triton"
-    )
-    assert done.returncode == 0, done.stderr
 
 
 def test_lanes_are_reset_by_hand_where_autoreset_is_off():

@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from torch.distributions import MultivariateNormal, Normal, kl_divergence
+from torch.distributions import MultivariateNormal, kl_divergence
 
 from jbrep.dae import DAE
 from jbrep.encoders.layers import run
-from jbrep.errors import InputError
 from jbrep.methods import vae
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import METHODS, name_of, read_name
-from jbrep.methods.vae import cross_entropy, divergence, posterior
+from jbrep.methods.vae import cross_entropy, posterior
 from jbrep.training.trainer import Trainer
 from jbrep.training.windows import Windows
 
@@ -31,13 +30,6 @@ def trainer(data, kind, epochs=2, learning_rate=1e-3, batch_size=250, **changes)
     return Trainer(it, method, *parts)
 
 
-def explained(encoder, data):
-    """R^2 of each feature over the held-out rows."""
-    rows = data.dataset["observation"][data.test]
-    lost = np.square(encoder.decode(encoder(rows)) - rows).mean(axis=0)
-    return 1 - lost / rows.var(axis=0)
-
-
 @pytest.mark.parametrize("kind", RELATIVES)
 def test_relatives_learn_to_reconstruct(kind, data, tmp_path):
     epochs, rate, least = RELATIVES[kind]
@@ -51,7 +43,7 @@ def test_relatives_learn_to_reconstruct(kind, data, tmp_path):
     assert 1 - np.square(back - rows).mean() / rows.var(axis=0).mean() > least
 
 
-@pytest.mark.parametrize("kind", ["ddae", "lld-vae", "forward", "deepmdp"])
+@pytest.mark.parametrize("kind", ["dae", "ddae", "lld-vae", "forward", "deepmdp"])
 def test_the_same_seed_gives_the_same_weights_also_after_a_resume(kind, data, tmp_path):
     one, other, half = (trainer(data, kind) for _ in range(3))
     list(one.epochs())
@@ -61,6 +53,7 @@ def test_the_same_seed_gives_the_same_weights_also_after_a_resume(kind, data, tm
     other.restore({}, tmp_path / "at")
     list(other.epochs())
     assert other.history == one.history
+    assert all(torch.equal(one.best[name], other.best[name]) for name in one.best)
     for name, parameter in one.objective.state_dict().items():
         assert torch.equal(other.objective.state_dict()[name], parameter)
 
@@ -82,12 +75,6 @@ def test_codes_are_drawn_in_training_and_means_in_evaluation(kind, data):
     rows = windows.rows(numbers)
     mean, _ = posterior(it.encoder(rows))
     np.testing.assert_allclose(run(encoder, rows.numpy()), mean.detach(), rtol=1e-4, atol=1e-6)
-
-
-def test_the_divergence_is_the_closed_form():
-    mean, log_deviation = torch.randn((2, 5, 3), generator=torch.Generator().manual_seed(0))
-    expected = kl_divergence(Normal(mean, log_deviation.exp()), Normal(0.0, 1.0))
-    torch.testing.assert_close(divergence(mean, log_deviation), expected)
 
 
 def test_the_transition_is_the_identity_and_a_product_of_vectors(data):
@@ -138,21 +125,9 @@ def test_a_weighted_feature_is_reconstructed_better(data, tmp_path):
     plain = fitter.fit("ae", **settings).encoder
     weighted = fitter.fit("ae", name="w", weights="velocity_x=30", **settings).encoder
     assert weighted.header.training["weights"] == {"velocity_x": 30}
-    errors = [1 - explained(encoder, data)[place] for encoder in (plain, weighted)]
-    assert errors[1] < errors[0] / 2
-
-
-@pytest.mark.parametrize("kind", ["dae", "vae"])
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"weights": "speed=2"}, "face_direction has no feature 'speed': it has position_x,"),
-        ({"weights": {"velocity_x": 2}, "keep": "velocity_x"}, "velocity_x passes around the enc"),
-    ],
-)
-def test_weights_that_cannot_be_are_named(kind, settings, said, data, tmp_path):
-    with pytest.raises(InputError, match=said):
-        Fitter(data, tmp_path).plan(kind, latent=4, **settings)
+    rows = data.dataset["observation"][data.test]
+    lost = [np.square(it.decode(it(rows)) - rows).mean(axis=0)[place] for it in (plain, weighted)]
+    assert lost[1] < lost[0] / 2
 
 
 def test_the_authors_begin_with_normal_weights_and_shake_a_batch_as_one(data):

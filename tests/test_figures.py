@@ -10,7 +10,7 @@ from made_up import drawn, found_of
 from PIL import Image
 
 from jbrep.reporting.figures import study_plots, write
-from jbrep.reporting.figures.panels import COLUMN, PAGE, PAPER, fitting
+from jbrep.reporting.figures.panels import COLUMN, PAGE, PAPER
 from jbrep.stats import RunCurve, analyse
 
 STEPS = np.arange(0, 50_001, 10_000)
@@ -53,16 +53,6 @@ def panels_of(figure):
     return {axes.get_title(loc="left"): axes for axes in figure.axes}
 
 
-def values(plot, column, **where):
-    return [r[column] for r in plot.rows if all(r[name] == each for name, each in where.items())]
-
-
-def test_a_study_has_every_figure(plots):
-    assert list(plots) == [
-        *("final_return", "representations", "differences", "profiles", "every_run")
-    ]
-
-
 def test_each_figure_is_written_as_pdf_and_png_beside_its_table(found, tmp_path):
     one = found.replace(groups=found.groups[:1], aggregates=[], runs=found.runs[:4])
     plots = {plot.name: plot for plot in study_plots(one)}
@@ -94,60 +84,15 @@ def test_curves_are_the_medians_of_the_statistics(plots, found):
     assert bands[0].y1 == pytest.approx(max(group.agents[0].curve["p90"]))
 
 
-def test_a_representation_has_one_colour_in_all_figures(found):
-    """Also where the statistics leave out a representation that comes before it."""
-    fewer = of_runs([run for run in runs() if run.representation != "dae-8"])
-    for some in (found, fewer.replace(representations=[*FINAL])):
-        colours = {
-            line.get_color()
-            for plot in study_plots(some)
-            for axes in drawn(plot).axes
-            for line in axes.lines
-            if line.get_label().startswith("pca-4")
-            or (
-                plot.name == "every_run"
-                and "pca-4" in axes.get_title(loc="left")
-                and len(line.get_xdata()) == 6
-            )
-        }
-        assert colours == {"#D55E00"}
-
-
-def of_runs(some, played=IN_TRAINING):
-    return found_of(analyse(some), some, played)
-
-
-def difference_panel(found):
-    (plot,) = [plot for plot in study_plots(found) if plot.name == "differences"]
-    return drawn(plot).axes[0], plot.rows
-
-
 def test_differences_from_the_baseline_stand_with_their_intervals(found):
-    axes, rows = difference_panel(found)
+    (plot,) = [plot for plot in study_plots(found) if plot.name == "differences"]
+    axes, rows = drawn(plot).axes[0], plot.rows
     value, *ends = found.groups[0].comparisons[0].numbers["final_return_difference"]
     assert (rows[0]["difference"], rows[0]["tested_low"]) == (value, None)
     (thick,) = [line for line in axes.lines if line.get_linewidth() == 2][:1]
     np.testing.assert_array_equal(thick.get_xdata(), ends)
-    assert axes.get_title(loc="left").replace("\n", " ") == "face_direction, ddpg"
     texts = [text.get_text() for text in axes.get_yticklabels()]
     assert texts == ["dae-8 - full", "pca-4 - full"]
-
-
-def test_limits_hold_what_is_near_and_not_what_is_far():
-    returns = [-400.0, -100.0, np.nan]
-    assert fitting(returns) == pytest.approx((-412, -88))
-    assert fitting(returns, near=[0]) == pytest.approx((-416, 16))
-    assert fitting(returns, near=[900]) == fitting(returns)
-    assert fitting(returns, ends=[-420, np.nan, 9000])[0] == pytest.approx(-420, abs=20)
-    assert fitting(returns, ends=[9000])[1] < 0
-    assert fitting([0.2, 0.2]) == pytest.approx((-0.3, 0.7))
-
-
-def test_without_statistics_the_runs_are_drawn_all_the_same(found):
-    assert [plot.name for plot in study_plots(found.replace(groups=[], aggregates=[]))] == [
-        "every_run"
-    ]
-    assert study_plots(found.replace(groups=[], aggregates=[], runs=[])) == []
 
 
 def test_diagnostics_stand_against_final_returns(found):

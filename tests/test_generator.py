@@ -1,7 +1,7 @@
-"""Commands read off Python functions: options, their help, and what is refused."""
+"""Commands read off Python functions: options, and what is refused."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,19 +15,14 @@ from jbrep.records.record import Record
 
 
 class Walk(Record, frozen=True, kw_only=True):
-    steps: Annotated[int, Meta(ge=1, le=10_000, description="In all.")]
-    length: Annotated[float, Meta(gt=0, description="Of each [m].")] = 0.5
-    gait: Annotated[Literal["trot", "pace"], Meta(extra={"default": "what is usual"})] = "trot"
-    start_at: Annotated[str, Meta(description="Where.")] = field(name="from", default="")
-    legs: Annotated[tuple[int, ...], Meta(description="Which.")] = ()
+    steps: Annotated[int, Meta(ge=1, le=10_000)]
+    length: Annotated[float, Meta(gt=0)] = 0.5
+    gait: Literal["trot", "pace"] = "trot"
+    start_at: str = field(name="from", default="")
+    legs: tuple[int, ...] = ()
 
 
 def robot(name: str = "bug", mass: Annotated[float, Meta(gt=0)] = 1.0) -> str:
-    """Describe it.
-
-    Args:
-        mass: of the robot [kg].
-    """
     return f"{name} of {mass} kg"
 
 
@@ -35,21 +30,12 @@ def walk(
     out: Path,
     name: Annotated[str, Meta(extra={"made_by": robot})],
     *,
-    back: Annotated[bool, Meta(description="And home again, not with `steps` 1.")] = False,
+    back: Annotated[bool, Meta(description="And home again.")] = False,
     lower: Mapping[str, Any] = {},
     hide: Sequence[str] = (),
-    watch: Callable[[], bool] = lambda: True,
     **walk: Annotated[Any, Walk],
 ) -> int:
-    """Walk.
-
-    As long as `steps` say.
-
-    Args:
-        out: a folder for
-            the film.
-        lower: what is lower.
-    """
+    """Walk."""
     print({"out": out, "name": name, "back": back, "lower": lower, "hide": hide, **walk})
     return 3
 
@@ -79,22 +65,6 @@ def test_a_function_may_take_the_options_of_another():
     assert ran.output.startswith(
         "bug True {'out': PosixPath('x'), 'name': 'bug of 1.0 kg', 'hide': ('a', 'b'), "
     )
-
-
-def test_help_is_the_docstrings():
-    text = " ".join(run("--help").output.split())
-    for line in (
-        "As long as --steps say. Options: --out PATH A folder for the film. [required]",
-        "--steps NUMBER In all. [required]",
-        "--back And home again, not with --steps 1.",
-        "--length FLOAT Of each [m]. [default: 0.5]",
-        "--gait [pace|trot] [default: what is usual]",
-        "--mass FLOAT Of the robot [kg]. [default: 1.0]",
-        "Example: jbrep walk --out x",
-    ):
-        assert line in text
-    assert "Args" not in text
-    assert "--watch" not in text
 
 
 @pytest.mark.parametrize(

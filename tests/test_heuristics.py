@@ -5,7 +5,7 @@ import pytest
 
 from jbrep.envs import Lanes, describe
 from jbrep.envs.recording import episode_returns
-from jbrep.jitterbug.heuristics import HEURISTICS, TURN, WALK, turn_by, walk_toward
+from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.tasks import TASKS
 
 LEAST = {
@@ -15,15 +15,6 @@ LEAST = {
     "move_to_position": 850,
     "move_to_pose": 500,
 }
-
-
-def state(motor_angle, motor_velocity, turning=0.0):
-    return {
-        "motor_angle": np.array([[motor_angle]]),
-        "motor_velocity": np.array([[motor_velocity]]),
-        "velocity": np.zeros((1, 3)),
-        "angular_velocity": np.array([[0, 0, turning]]),
-    }
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -42,25 +33,3 @@ def test_policies_are_functions_of_the_observation_alone(task):
     for row in (0, 7):
         one = HEURISTICS[task](observation[row : row + 1])
         np.testing.assert_allclose(one[0], action[row], rtol=1e-12)
-
-
-def test_the_swing_is_driven_through_the_bearing_and_turned_back_beyond_it():
-    bearing = np.array([[0.5]])
-    for side in (1, -1):
-        assert side * walk_toward(state(0.5, side * 40.0), bearing, WALK)[0, 0] > 0.3
-        beyond = state(0.5 + side * (np.pi / 2 + WALK.late * 20), side * 20.0)
-        assert side * walk_toward(beyond, bearing, WALK)[0, 0] < -0.2
-
-
-def test_a_weight_at_rest_is_set_in_motion_off_the_bearing():
-    assert walk_toward(state(1.0, 0.0), np.zeros((1, 1)), WALK)[0, 0] < -0.5
-
-
-def test_turning_goes_by_the_shorter_side_and_rests_when_near():
-    def drive(angle, **motion):
-        return turn_by(state(0.0, **motion), np.array([[angle]]), TURN)[0, 0]
-
-    assert drive(1.0, motor_velocity=0.0) == TURN.burst == -drive(-1.0, motor_velocity=0.0)
-    assert drive(1.0, motor_velocity=TURN.fast + 1) == TURN.coast
-    assert drive(TURN.near / 2, motor_velocity=0.0) == 0
-    assert drive(0.5, motor_velocity=0.0, turning=0.5 / TURN.ahead) == 0  # it turns there anyway

@@ -1,6 +1,7 @@
 """Numbers that an environment tells in `info`: in evaluations, tables and reports."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from command import in_this_process, jbrep, refused
 from small import flip_bit
 
 from jbrep.envs import describe
-from jbrep.envs.infos import by_name, number_of, numbers_in, shares, shares_text
+from jbrep.envs.infos import by_name, number_of, numbers_in, shares
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.names import import_modules
 from jbrep.reporting import report
@@ -55,15 +56,10 @@ def test_what_counts_as_a_number():
     assert numbers_in({"a": 1, 2: 3, "b\n": 1, "": 1, "c" * 65: 1, "d": {"e": 1}}) == {"a": 1.0}
 
 
-def test_what_dm_control_tells_of_steps_is_no_share():
-    assert shares({"timestep.discount": [1.0, 1.0], "timestep.step_type": [2.0, 2.0]}) == {}
-
-
 def test_shares_are_numbers_that_are_0_or_1():
     values = by_name([{"a": 1.0, "b": 0.5}, {"a": 0.0, "c": 1.0}, {"a": 0.0}])
     assert values == {"a": [1.0, 0.0, 0.0], "b": [0.5], "c": [1.0]}
     assert [*shares(values)] == ["a", "c"]
-    assert shares_text(values) == "a 0.33 in 3 episodes; c 1.00 in 1 episode"
 
 
 def test_an_episode_succeeds_if_any_of_its_steps_does():
@@ -93,18 +89,14 @@ def test_a_run_keeps_them_and_says_the_shares(run):
     ]
     assert read_infos(folder) == rows  # to the last bit
     assert "is_success 0.50 in 6 episodes; slid 0.33 in 6 episodes\n" in said
-    assert (folder / INFOS).read_text().startswith("step,episode,name,value\n0,0,is_success,0.0\n")
     assert INFOS in read_run(folder).tables
 
 
 def test_evaluate_policy_says_them(run):
     folder, _ = run
-    command = ("evaluate-policy", folder, "--episodes", 5)
-    assert jbrep(*command).stdout.endswith(
-        "\nis_success 0.40 in 5 episodes; slid 0.40 in 5 episodes\n"
-    )
+    command = ("evaluate-policy", folder, "--episodes", 5, "--json")
     expected = [dict(zip(NAMES, told(episode), strict=True)) for episode in range(5)]
-    assert json.loads(jbrep(*command, "--json").stdout)["infos"] == expected
+    assert json.loads(jbrep(*command).stdout)["infos"] == expected
 
 
 @pytest.fixture(scope="module")
@@ -133,22 +125,19 @@ def test_a_study_has_them_in_a_table_of_its_own(study, tmp_path):
         for episode in range(episodes)
         for each in zip(NAMES, told(episode), strict=True)
     ]
-    for name in ("runs.json", "returns.csv", "references.csv", RUN_INFOS):
-        (tmp_path / name).write_bytes((folder / name).read_bytes())
-    flip_bit(tmp_path / RUN_INFOS, 300)
-    assert f"{RUN_INFOS} was changed after it was written" in refused(read_tables, tmp_path)
+    copied = shutil.copytree(folder, tmp_path / "copied")
+    flip_bit(copied / RUN_INFOS, 300)
+    assert RUN_INFOS in refused(read_tables, copied)
 
 
 def test_reports_have_a_column_for_each_share(study):
-    folder, said = study
+    folder, _ = study
     scored, sledge = returns_tables(Findings.of(read_tables(folder)))
     heads = ("share of is_success", "share of slid")
     assert scored.header[-2:] == heads
     assert [row[-2:] for row in scored.rows] == [("0.50", "0.33"), *[("-", "-")] * 3]
     assert not {*heads} & {*sledge.header}
-    assert all(f"  {head}" in said for head in heads)
-    for name in ("report.html", "summary.md"):
-        assert heads[0] in (folder / name).read_text()
+    assert heads[0] in (folder / "report.html").read_text()
 
 
 def test_shares_are_of_last_evaluations_and_have_intervals(study):

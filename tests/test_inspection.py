@@ -7,25 +7,18 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import rerun as rr
 from command import jbrep
-from made_up import write_checkpoint
 from rerun.chunk import RrdReader
-from small import ONE_EACH
+from scipy.spatial.transform import Rotation
 
 from jbrep.encoders import find
 from jbrep.envs import describe
-from jbrep.envs.physics import Motion
 from jbrep.errors import InputError
 from jbrep.inspection import inspect
-from jbrep.inspection.blueprint import traversal_layout
-from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot, shapes
 from jbrep.inspection.scene import shades
-from jbrep.inspection.signals import principal_components
 from jbrep.inspection.subject import POINTS, SPACING, sweep
 from jbrep.play.sources import find_episode
-from jbrep.rl import Run
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
 DAE = "jbrep/encoders/shipped/face_direction/dae-4.safetensors"
@@ -57,21 +50,10 @@ def names(entity):
     return entity["SeriesLines:names"].to_pylist()[0]
 
 
-def text(entity):
-    return entity["TextDocument:text"].to_pylist()[0][0]
-
-
 def poses(entity):
     """Positions (n, 3) and quaternions (n, 4), w first."""
     turned = values(entity, "Transform3D:quaternion")[:, 0]
     return values(entity, "Transform3D:translation")[:, 0], turned[:, [3, 0, 1, 2]]
-
-
-def rotate(quaternion, vector):
-    """Vectors (n, 3) rotated by quaternions (n, 4)."""
-    scalar, axis = quaternion[:, :1], quaternion[:, 1:]
-    across = np.cross(axis, vector)
-    return vector + 2 * (scalar * across + np.cross(axis, across))
 
 
 @pytest.fixture(scope="module")
@@ -100,12 +82,6 @@ def entities(recorded):
 
 
 @pytest.fixture(scope="module")
-def unchanged(folder):
-    """Of an encoder that gives back what it took, on the task that observes most."""
-    return inspect(POSE, encoder="full", out=folder / "full.rrd")
-
-
-@pytest.fixture(scope="module")
 def traversed(folder):
     return inspect(FACE, 1, encoder="dae-8", traverse=True, out=folder / "traverse.rrd")
 
@@ -131,23 +107,6 @@ def test_poses_are_the_episodes(entities, rollout):
     target, turned = poses(entities["/world/surroundings/target"])
     np.testing.assert_allclose(target[0], motion.arrays["mocap_pos"][0, 0], atol=1e-7)
     np.testing.assert_allclose(turned[0], motion.arrays["mocap_quat"][0, 0], atol=1e-7)
-    model, data = motion.model, mujoco.MjData(motion.model)
-    for row in range(0, ROWS, 250):
-        motion.put(data, row)
-        mujoco.mj_kinematics(model, data)
-        for name in ("leg3_lower", "weight"):
-            there, attitude = poses(entities[f"/world/robot/{name}"])
-            np.testing.assert_allclose(there[row], data.body(name).xpos, atol=1e-7)
-            np.testing.assert_allclose(attitude[row], data.body(name).xquat, atol=3e-7)
-
-
-def test_the_timelines(entities):
-    entity = entities["/observation/position"]
-    np.testing.assert_array_equal(entity["step"].to_numpy(), np.arange(ROWS))
-    time = entity["time"].to_numpy(zero_copy_only=False) / np.timedelta64(10, "ms")
-    np.testing.assert_array_equal(time, np.arange(ROWS))
-    assert entities["/action"]["step"].to_numpy()[-1] == ROWS - 2
-    assert entities["/reward/total"]["step"].to_numpy()[0] == 1
 
 
 def test_series_are_the_episodes(entities, rollout):
@@ -159,6 +118,10 @@ def test_series_are_the_episodes(entities, rollout):
     np.testing.assert_array_equal(scalars(entities["/action"]), rollout.action)
     assert names(entities["/action"]) == ["action_0 [-1, 1]"]
     np.testing.assert_array_equal(scalars(entities["/reward/total"])[:, 0], rollout.reward)
+    assert entities["/action"]["step"].to_numpy()[-1] == ROWS - 2
+    assert entities["/reward/total"]["step"].to_numpy()[0] == 1  # of the state that it led to
+    time = entity["time"].to_numpy(zero_copy_only=False) / np.timedelta64(10, "ms")
+    np.testing.assert_array_equal(time, np.arange(ROWS))
 
 
 def test_what_is_decoded(entities, rollout):
@@ -177,13 +140,13 @@ def test_what_is_decoded(entities, rollout):
     np.testing.assert_array_equal(position, decoded[:, :3].astype(np.float32))
     length = np.linalg.norm(decoded[:, 3:7], axis=1, keepdims=True)
     np.testing.assert_allclose(quaternion, decoded[:, 3:7] / length, atol=1e-6)
-    _, weight = poses(entities["/world/ghost/weight"])
-    half = (decoded[:, 13] - np.pi / 2) / 2
-    turned = np.stack((np.cos(half), 0 * half, 0 * half, np.sin(half)), axis=1)
-    x, y, z = (rotate(turned, np.tile(axis, (ROWS, 1))) for axis in np.eye(3))
-    for ours, axis in zip(np.eye(3), (x, y, z), strict=True):
-        there = rotate(weight, np.tile(ours, (ROWS, 1)))
-        np.testing.assert_allclose(there, rotate(quaternion, axis), atol=1e-5)
+    half = (decoded[:, 13] - np.pi / 2) / 2  # of the weight's turn about the vertical of the body
+    turned = Rotation.from_quat(np.column_stack((0 * half, 0 * half, np.sin(half), np.cos(half))))
+    there, body = (
+        Rotation.from_quat(poses(entities[f"/world/ghost/{name}"])[1], scalar_first=True)
+        for name in ("weight", "jitterbug")
+    )
+    np.testing.assert_allclose((there.inv() * body * turned).magnitude(), 0, atol=1e-5)
     apart = np.linalg.norm(decoded[:, :3] - qpos[:, :3], axis=1)
     bodies = entities["/error/bodies"]
     assert names(bodies)[0] == "jitterbug [mm]"
@@ -191,39 +154,6 @@ def test_what_is_decoded(entities, rollout):
     shown = values(entities["/world/ghost/jitterbug"], "Boxes3D:colors")[:, 0]
     expected = shades(apart).astype(np.uint32) @ (1 << np.array([24, 16, 8, 0], np.uint32))
     np.testing.assert_array_equal(shown, expected)  # not one for all times, which would win
-
-
-def test_an_encoder_that_keeps_all_gives_the_robot_back(unchanged):
-    found = read(unchanged)
-    place, turned = poses(found["/world/ghost/jitterbug"])
-    there, attitude = poses(found["/world/robot/jitterbug"])
-    up_to_sign = np.where((turned * attitude).sum(axis=1, keepdims=True) < 0, -1, 1)
-    np.testing.assert_allclose(place, there, atol=1e-5)
-    np.testing.assert_allclose(turned * up_to_sign, attitude, atol=1e-5)
-
-
-def test_principal_components():
-    random = np.random.default_rng(0)
-    latent = random.normal(size=(200, 5)) * (0.1, 3, 0.1, 1, 0.1)
-    path = principal_components(latent)
-    np.testing.assert_allclose(np.corrcoef(path.T), np.eye(2), atol=1e-12)
-    assert path[:, 0].std() > path[:, 1].std() > 0.9
-    two = latent[:, [1, 3]]
-    apart = np.linalg.norm(two[1:] - two[:-1], axis=1)
-    kept = principal_components(two)
-    np.testing.assert_allclose(np.linalg.norm(kept[1:] - kept[:-1], axis=1), apart)
-    assert not principal_components(latent[:, :1])[:, 1].any()
-
-
-@pytest.mark.parametrize("recording", ["recorded", "traversed"])
-def test_recordings_are_small_and_bring_their_layout(recording, request):
-    path = request.getfixturevalue(recording)
-    assert path.stat().st_size < 4e6
-    (layout,) = RrdReader(path).blueprints()
-    assert layout.application_id == "jbrep"
-    chunks = [columns(chunk) for chunk in RrdReader(path).stream(store=layout)]
-    name = "TimePanelBlueprint:play_state"
-    assert [each[name].to_pylist() for each in chunks if name in each] == [[[2]]]  # playing
 
 
 def identity(path):
@@ -260,8 +190,6 @@ def test_a_traversal_shows_what_each_unit_decodes_to(traversed, rollout):
         np.testing.assert_array_equal(series["traverse"].to_numpy(), np.arange(POINTS))
         most = encoder.task.feature_names[np.ptp(scaled, axis=0).argmax()]
         assert names(found[f"/traverse/unit_{unit}/most"])[0] == f"{most} [scaled]"
-        row = re.search(rf"^\| {unit} \|.*$", text(found["/traverse/summary"]), re.M)[0]
-        assert f"| {most} " in row
         position, quaternion = poses(found[f"/world/unit_{unit}/jitterbug"])
         np.testing.assert_allclose(position[:, 0], SPACING * (unit - 3.5), atol=1e-6)
         np.testing.assert_allclose(position[:, 2], decoded[:, 2], rtol=1e-6)
@@ -292,9 +220,7 @@ def test_any_robot_of_mujoco_is_recorded(short):
         assert len(position) == rows
         np.testing.assert_allclose(position[-1], data.xpos[body], atol=1e-6)
         np.testing.assert_allclose(quaternion[-1], data.xquat[body], atol=1e-6)
-    action = found["/action"]
-    np.testing.assert_array_equal(scalars(action), rollout.action)
-    assert names(action)[-1] == f"action_{rollout.task.action_size - 1} [-1, 1]"
+    np.testing.assert_array_equal(scalars(found["/action"]), rollout.action)
     np.testing.assert_array_equal(scalars(found["/reward/total"])[:, 0], rollout.reward)
     end = found["/reward/total"]["time"].to_pylist()[-1].total_seconds()
     assert end == pytest.approx(len(rollout) * rollout.task.timestep)
@@ -308,11 +234,8 @@ def test_a_robot_without_mujoco_shows_its_signals(short):
     rollout, found = short("Pendulum-v1", encoder="full")
     np.testing.assert_array_equal(scalars(found["/observation/obs"]), rollout.observation)
     assert names(found["/observation/obs"]) == ["obs_0", "obs_1", "obs_2"]
-    assert names(found["/action"]) == ["action_0 [-2, 2]"]
-    assert len(scalars(found["/latent/units"])) == 31
     assert scalars(found["/error/total"]).max() < 1e-6
     assert not any(path.startswith("/world") for path in found)
-    assert f"- return: {rollout.episode_return:.1f}" in text(found["/provenance"])
 
 
 SHAPES = """
@@ -368,52 +291,17 @@ def test_shapes_of_every_kind():
     apart = np.linalg.norm(corners[:, None] - expected, axis=2)
     np.testing.assert_allclose(apart.min(axis=0), 0, atol=1e-6)
     np.testing.assert_allclose(apart.min(axis=1), 0, atol=1e-6)
-    normals = np.array(mesh.vertex_normals.as_arrow_array().to_pylist())
-    outward = corners - expected.mean(axis=0)
-    assert ((normals * outward).sum(axis=1) > 0).all()
-
-
-def test_bodies_that_stand_still_have_one_pose_and_bare_ones_no_shape(folder):
-    model = mujoco.MjModel.from_xml_string(SHAPES)
-    robot, motion = Robot(model), Motion(model, {"qpos": np.tile(model.qpos0, (3, 1))})
-    motion.qpos[:, 0] = (0, 1, 2)
-    recording = Recording("it", "shapes")
-    times = [rr.TimeColumn("step", sequence=np.arange(3))]
-    robot.draw(recording, "robot", times, robot.poses(motion), [1, 2, 3])
-    recording.write(folder / "shapes.rrd", traversal_layout(1, None, np.zeros((1, 3))))
-    found = read(folder / "shapes.rrd")
-    paths = ("a_b", "bare", "body_3")
-    moving = {path: len(poses(found[f"/robot/{path}"])[0]) for path in paths}
-    assert moving == {"a_b": 3, "bare": 3, "body_3": 1}
-    assert "Mesh3D:vertex_positions" in found["/robot/a_b"]
-    assert not any(":colors" in name for name in found["/robot/bare"])
-
-
-def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(tmp_path):
-    task = describe("face_direction", max_episode_steps=50)
-    write_checkpoint(
-        tmp_path,
-        Run.of(task, "a2c", encoder="dae-4", preset="paper", **ONE_EACH),
-        12_000,
-    )
-    shown = read(inspect(str(tmp_path), out=tmp_path / "it.rrd"))
-    assert f"# {tmp_path} at step 12,000" in text(shown["/provenance"])
-    assert "/world/ghost/jitterbug" in shown
-    other = read(inspect(str(tmp_path), encoder="dae-8", out=tmp_path / "other.rrd"))
-    assert "- encoder: dae-8 (dae)" in text(other["/provenance"])
 
 
 @pytest.mark.parametrize(
     ("given", "named"),
     [
         ({}, "SOURCE"),
-        ({"source": "tests"}, "tests is no data set"),
         ({"source": FACE, "episode": 9}, "episode 9"),
         ({"source": FACE, "task": describe("move_to_pose")}, "move_to_pose"),
         ({"source": FACE, "traverse": True}, "--traverse"),
         ({"encoder": "dae-8"}, "--task"),
         ({"source": POSE, "encoder": DAE}, "dae-4"),
-        ({"source": FACE, "out": Path("README.md")}, "README.md"),
     ],
 )
 def test_mistakes(given, named):
@@ -438,10 +326,8 @@ def test_the_command_names_the_file_after_its_content(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told = jbrep("inspect", FACE, "--episode", 1, "--encoder", "dae-8").output
     path = "inspect/face_direction-data-sample-episode-1-dae-8.rrd"
-    assert told == f"encoder: dae-8, shipped\nopen it with:\nrerun {path}\n"
+    assert told.endswith(f"{path}\n")
     assert len(read(tmp_path / path)["/observation/position"]["step"]) == ROWS
-    told = jbrep("inspect", "--encoder", "dae-4", "--task", "move_to_pose", "--traverse").output
-    assert "inspect/move_to_pose-uniform-episode-0-dae-4-traverse.rrd\n" in told
 
 
 def test_the_viewer_is_rerun_itself(brief, tmp_path, monkeypatch):

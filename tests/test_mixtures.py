@@ -6,11 +6,9 @@ from command import jbrep
 from small import contents, settings
 
 from jbrep.collecting import collect
-from jbrep.collecting.derive import derive
 from jbrep.collecting.policies import parse_policy
 from jbrep.collecting.replay import repair
 from jbrep.dataset import Dataset
-from jbrep.dataset.formats import export
 from jbrep.dataset.manifest import find_problems
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
@@ -32,7 +30,7 @@ def mixture(tmp_path_factory):
     return folder
 
 
-def test_episodes_say_which_policy_acted_in_them(mixture, tmp_path):
+def test_episodes_say_which_policy_acted_in_them(mixture):
     dataset = Dataset(mixture)
     drawn = dataset.episodes["policy"]
     assert drawn.dtype == np.int32
@@ -42,12 +40,7 @@ def test_episodes_say_which_policy_acted_in_them(mixture, tmp_path):
         actions = dataset.episode(number)["action"]
         kind = 2 if (actions == 0.5).all() else int((actions[0] == 0).all())
         assert kind == part
-    told = jbrep("data", "info", mixture).output
-    assert "0.4 of uniform; 0.3 of ornstein-uhlenbeck, mu 0.0" in told
     assert jbrep("data", "verify", mixture, "--replay", 2).exit_code == 0
-    export(dataset, "npz", tmp_path / "it.npz")
-    with np.load(tmp_path / "it.npz") as archive:
-        np.testing.assert_array_equal(archive["episodes/policy"], drawn)
 
 
 def test_neither_lanes_nor_threads_nor_repair_change_a_byte(mixture, tmp_path):
@@ -62,15 +55,9 @@ def test_in_processes_and_extended(tmp_path):
     """Of episodes of any length."""
     policy = parse_policy("uniform:1+constant:drive=-1:1").settings()
     how = {"task": describe("Sledges/Sledge-v0"), "policy": policy, "store_state": False}
-    for steps, workers in ((60, 1), (61, 2), (150, 1), (400, 2)):
+    for steps, workers in ((60, 1), (61, 2), (150, 1)):
         some = settings(**how, steps=steps, shard_episodes=5)
         collect(some, tmp_path / "data", num_threads=workers)
     collect(some, tmp_path / "at once", num_threads=1)
     assert contents(tmp_path / "data") == contents(tmp_path / "at once")
     assert not list(find_problems(tmp_path / "data"))
-
-
-def test_other_tasks_are_derived_from_a_mixture(mixture, tmp_path):
-    derive(mixture, "move_to_pose", tmp_path / "derived", store_state=True)
-    collect(mixed("move_to_pose"), tmp_path / "collected")
-    assert contents(tmp_path / "derived") == contents(tmp_path / "collected")

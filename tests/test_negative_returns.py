@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from jbrep.errors import InputError
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.rules import Planned, Rules
 
@@ -126,33 +125,3 @@ def test_each_verdict_can_be_reached(analysis):
     assert verdicts(analysis, "dae-2") == [("supported", None)] * 3
     assert verdicts(analysis, "pca-1") == [("contradicted", None)]
     assert verdicts(analysis, "dae-1") == [("undecided", None)]  # but for the failed run, similar
-
-
-def test_a_baseline_that_ends_where_it_began_sets_nothing_to_reach():
-    worse = [make("full", seed, START - 50) for seed in range(3)]
-    (group,) = analyse(worse).groups
-    assert np.isnan([*group.thresholds.values()]).all()
-    assert group.labels[0].numbers["steps_to_50_percent"].tolist() == [None] * 3
-
-
-def test_groups_have_failures_of_their_own(runs):
-    """Of another task, or another algorithm on the same one, nothing is taken over."""
-    other = [RunCurve(**{**vars(run), "algorithm": "td3"}) for run in runs]
-    worse = RunCurve(**{**vars(other[0]), "returns": other[0].returns - 5000})
-    analysis = analyse([*runs, worse, *other[1:]])
-    sac, td3 = analysis.groups
-    assert sac.failure_return == WORST
-    assert td3.failure_return == worse.returns.min()
-
-
-def test_returns_below_the_floor_are_refused():
-    with pytest.raises(InputError, match="its task says that returns are from -1000"):
-        make("full", 0, -200, return_floor=-1000)
-    rounded = np.full((len(STEPS), 2), -1000.0005)
-    assert make("full", 0, -200, return_floor=-1000, returns=rounded).return_floor == -1000
-
-
-# figures
-
-
-# the report

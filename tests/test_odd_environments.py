@@ -11,6 +11,8 @@ import pytest
 from command import jbrep
 from odd import FAILS, HARMLESS
 
+import jbrep.inspection.recording  # so that not every fork imports it, nor what trains
+import jbrep.rl.training
 from jbrep.cli import main
 from jbrep.dataset import Dataset
 

@@ -1,7 +1,5 @@
 """Users' own encoders wherever an encoder is used: objects, functions, torch modules, code."""
 
-import json
-import re
 from pathlib import Path
 
 import gymnasium
@@ -24,12 +22,10 @@ from jbrep.encoders import find
 from jbrep.encoders.base import as_encoder
 from jbrep.envs import describe
 from jbrep.envs.names import import_code
-from jbrep.errors import InputError
 from jbrep.evaluation import diagnose
 from jbrep.jitterbug import JitterbugEnv
-from jbrep.reporting.evaluation import evaluation_text
-from jbrep.rl import Run, Session, train
-from jbrep.rl.files import CHECKPOINT, ENCODER, RUN
+from jbrep.rl import Run, train
+from jbrep.rl.files import ENCODER
 from jbrep.rl.policy import load_run
 
 FACE = "Jitterbug/FaceDirection-v0"
@@ -90,12 +86,11 @@ def like(dtype):
 
 
 class Unscaled(nn.Module):
-    """A module without parameters; one with whole numbers alone."""
+    """A module without parameters, with whole numbers alone."""
 
-    def __init__(self, *, counts=False):
+    def __init__(self):
         super().__init__()
-        if counts:
-            self.register_buffer("seen", torch.tensor([1]))
+        self.register_buffer("seen", torch.tensor([1]))
 
     def forward(self, observation):
         return observation.sum(1, keepdim=True).repeat(1, 2) / 2
@@ -116,8 +111,6 @@ def test_a_transformer_of_scikit_learn_is_an_encoder():
     frame = pandas.DataFrame(rows, columns=["cos", "sin", "speed"])
     of_frame = as_encoder(PCA(2).fit(frame), describe("Pendulum-v1"))  # warns of nothing
     assert of_frame.encode(rows).shape == (200, 2)
-    with pytest.raises(InputError, match=r"PCA failed: NotFittedError: .*"):
-        as_encoder(PCA(2), describe("Pendulum-v1"))
 
 
 @pytest.mark.parametrize(
@@ -127,7 +120,6 @@ def test_a_transformer_of_scikit_learn_is_an_encoder():
         lambda rows: (rows.sum(1, keepdims=True).repeat(2, 1) / 2).astype(np.float64).tolist(),
         *(like(dtype) for dtype in (torch.float32, torch.float64, torch.bfloat16)),
         Unscaled(),
-        Unscaled(counts=True),
     ],
 )
 def test_whatever_encodes_is_an_encoder(given):
@@ -155,18 +147,18 @@ def test_a_module_is_used_in_evaluation_mode_and_left_as_it_was():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (only(), "Odd has neither `encode` nor `transform`"),
+        (only(), "Odd has neither"),
         (Half, "Half is a class"),
-        (only(encode=7), "Odd has neither `encode` nor `transform`"),
-        (nn.Module(), "Module failed: NotImplementedError"),
-        (only(encode=Half.encode, latent_size=4), "its latent_size is 4"),
-        (Spoilt(lambda rows: (rows, rows), 0), "TypeError: it returned a tuple"),
-        (Spoilt(lambda rows: rows[0], 0), "returned shape (3,) for 256 rows"),
-        (Spoilt(lambda rows: rows[:, :0], 0), "returned latents of no numbers"),
+        (PCA(2), "PCA failed: NotFittedError"),
+        (only(encode=Half.encode, latent_size=4), "latent_size is 4"),
+        (Spoilt(lambda rows: (rows, rows), 0), "tuple"),
+        (Spoilt(lambda rows: rows[0], 0), "shape (3,)"),
+        (Spoilt(lambda rows: rows[:, :0], 0), "no numbers"),
         (Spoilt(lambda rows: rows.astype(float) * 1e300, 0), "not finite"),
-        (Spoilt(lambda rows: rows[:, 1:], 1), "for the same observations the next time"),
-        (lambda rows: rows - rows.mean(0), "for the same observations in a batch of one"),
-        (nn.Linear(4, 2), "Linear failed: RuntimeError"),
+        (Spoilt(lambda rows: rows[:, 1:], 1), "the next time"),
+        (lambda rows: rows - rows.mean(0), "a batch of one"),
+        (only(encode=Half.encode, check_task=lambda self, task: 1 / 0), "Odd refuses Pendulum-v1"),
+        (as_encoder(Half(), describe("face_direction")), "of 16 numbers"),
     ],
 )
 def test_what_is_no_encoder_is_refused_in_one_line(given, message):
@@ -176,27 +168,13 @@ def test_what_is_no_encoder_is_refused_in_one_line(given, message):
 @pytest.mark.parametrize(
     ("what", "message"),
     [
-        (lambda rows: rows, "Spoilt returned shape (5, 3)"),
-        (lambda rows: rows[:, :2] * np.nan, "Spoilt returned numbers that are not finite"),
-        (lambda rows: 1 / 0, "Spoilt failed: ZeroDivisionError"),
+        (lambda rows: rows, "shape (5, 3)"),
+        (lambda rows: rows[:, :2] * np.nan, "not finite"),
+        (lambda rows: 1 / 0, "ZeroDivisionError"),
     ],
 )
 def test_an_encoder_is_checked_at_every_call(what, message):
     assert message in refused(as_encoder(Spoilt(what), TASK).encode, ROWS)
-
-
-def test_what_an_own_encoder_lacks_or_refuses():
-    assert "Half has no decoder" in refused(as_encoder(Half(), TASK).decode, ROWS[:, :2])
-    face = describe("face_direction")
-    assert "Half takes observations of 3 numbers, but" in refused(
-        as_encoder, as_encoder(Half(), TASK), face
-    )
-
-    def check_task(self, task):
-        raise ValueError("not this one")
-
-    picky = only(encode=Half.encode, check_task=check_task)
-    assert "Odd refuses Pendulum-v1: ValueError: not this one" in refused(as_encoder, picky, TASK)
 
 
 @pytest.mark.parametrize("name", ["test_own:Half", "test_own:half", "test_own:make_half"])
@@ -205,34 +183,18 @@ def test_code_is_a_class_or_a_function_that_makes_an_encoder_or_is_one(name):
     np.testing.assert_array_equal(find(name, TASK).encode(ROWS), ROWS[:, :2] / 2)
 
 
-def test_code_is_shown_as_far_as_it_is_known_and_not_exported(tmp_path):
-    told = jbrep("encoder", "info", "test_own:Whole", "--task", "Pendulum-v1").output
-    assert told.startswith("Whole\n")
-    assert "test_own:Whole, code" in told
-    assert re.search(r"decodes +yes", told)
-    card = json.loads(
-        jbrep("encoder", "info", "test_own:Half", "--task", "Pendulum-v1", "--json").output
-    )
-    assert (card["kind"], card["latent_size"], card["decodes"]) == ("own", 2, False)
-    out = tmp_path / "it.onnx"
-    told = jbrep("encoder", "export", "test_own:Half", "--task", "Pendulum-v1", "--out", out)
-    assert (told.exit_code, out.exists()) == (2, False)
-    assert "give its --task" in mistake("encoder", "info", "test_own:Half")
-
-
 def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
     data = wide([300, 250, 99, 180], features=4)
     evaluation = diagnose({"half": Half(), "whole": Whole(), "module": nn.Linear(4, 6)}, data)
     assert evaluation.seen == dict.fromkeys(("half", "whole", "module"), "maybe")
     own = evaluation.encoders
     assert own["half"].reconstruction is None
-    assert own["half"].scores["next"].value is not None
+    assert own["half"].scores["forward"].value is not None
     assert own["whole"].reconstruction.mse.value < 1e-9
     probe = own["whole"].nonlinear_probes["obs_1"].value
     assert probe == pytest.approx(own["full"].nonlinear_probes["obs_1"].value, rel=1e-6)
     assert (own["module"].kind, own["module"].latent) == ("own", 6)
-    shown = evaluation_text(evaluation, everything=True)
-    assert re.search(r"^half .* +- +-$", shown, re.MULTILINE)  # no error, in no unit
+    assert "Half has no decoder" in refused(as_encoder(Half(), TASK).decode, ROWS[:, :2])
 
 
 @pytest.fixture(scope="module")
@@ -252,11 +214,9 @@ def test_a_run_on_code_is_played_once_its_module_may_run(trained, monkeypatch):
     run, played = trained / "code", ("evaluate-policy", trained / "code", "--episodes", 1)
     assert not (run / ENCODER).exists()
     monkeypatch.setattr("jbrep.envs.names._imported", [])
-    assert "importing test_own runs it; if you trust it, add --import test_own" in mistake(*played)
-    told = mistake(*played, "--encoder", "test_own:Whole")
-    assert "Whole is not the encoder that the run" in told
-    told = jbrep(*played, "--encoder", "test_own:Half")
-    assert "encoder: test_own:Half, code\nPendulum-v1 on Half: median return" in told.output
+    assert "--import test_own" in mistake(*played)
+    assert "Whole" in mistake(*played, "--encoder", "test_own:Whole")
+    assert "on Half: median" in jbrep(*played, "--encoder", "test_own:Half").output
     monkeypatch.setattr("jbrep.envs.names._imported", [])
     assert "on Half: median" in jbrep(*played, "--import", "test_own").output
     monkeypatch.setattr(Half, "encode", lambda self, rows: rows[:, :2] / 3)
@@ -270,17 +230,6 @@ def test_a_run_on_an_object_needs_it_again(trained):
     assert "Half is not the encoder that the run in" in refused(load_run, folder, Half())
 
 
-def test_a_run_whose_encoder_fails_keeps_its_checkpoint(tmp_path):
-    spoilt = Spoilt(lambda rows: rows[:, :2] * np.nan, after=26)
-    run = Run.of(task=TASK, algorithm="a2c", encoder=spoilt, steps=80, preset="paper", **ONE_EACH)
-    with pytest.raises(InputError, match="Spoilt returned numbers that are not finite"):
-        train(run, tmp_path, Session(save_every=0))
-    assert (tmp_path / CHECKPOINT).exists()
-    assert not (tmp_path / RUN).exists()
-    spoilt.left = 1000
-    assert train(run, tmp_path).status == "finished"
-
-
 def one(**options):
     """A Jitterbug with short episodes."""
     return gymnasium.make(FACE, max_episode_steps=10, **options)
@@ -289,7 +238,6 @@ def one(**options):
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of unbounded observations, of the wrapper
 def test_an_encoded_environment_shows_latents():
     env = Encoded(one(), "dae-8")
-    assert isinstance(env, gymnasium.Wrapper)
     assert env.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (8,), np.float32)
     assert env.task == describe("face_direction", max_episode_steps=10)
     check_env(env)
@@ -306,7 +254,6 @@ def test_latents_are_those_of_the_vec_env_to_the_bit(lanes):
         first = theirs.reset()
     else:
         theirs = Encoded(gymnasium.make_vec(FACE, num_envs=3, max_episode_steps=10), "dae-8")
-        assert isinstance(theirs, gymnasium.vector.VectorWrapper)
         first, _ = theirs.reset(seed=3)
     np.testing.assert_array_equal(first, ours.reset())
     assert first in theirs.observation_space if lanes > 1 else first[0] in theirs.observation_space
@@ -323,21 +270,12 @@ def test_latents_are_those_of_the_vec_env_to_the_bit(lanes):
 @pytest.mark.parametrize(
     ("env", "message"),
     [
-        (lambda: one(scaled=True), "observations are scaled already"),
+        (lambda: one(scaled=True), "scaled already"),
         (lambda: JitterbugEnv("face_direction"), "without a spec"),
-        (lambda: gymnasium.make("Jitterbug/MoveToPose-v0"), "dae-8 was made for face_direction"),
-        (lambda: gymnasium.wrappers.NormalizeObservation(one()), "NormalizeObservation changes"),
-        (lambda: Encoded(one(), "dae-8"), "EncodedEnv changes"),
+        (lambda: gymnasium.make("Jitterbug/MoveToPose-v0"), "face_direction"),
+        (lambda: gymnasium.wrappers.NormalizeObservation(one()), "NormalizeObservation"),
     ],
 )
 def test_environments_that_an_encoder_can_t_read(env, message):
     file = Path("jbrep/encoders/shipped/face_direction/dae-8.safetensors")
     assert message in refused(Encoded, env(), file)
-
-
-def test_a_task_that_is_given_must_have_as_many_features():
-    bare = JitterbugEnv("face_direction")
-    assert Encoded(bare, "dae-8", "face_direction").reset(seed=0)[0].shape == (8,)
-    assert "have 16 numbers, where move_to_pose has 19" in refused(
-        Encoded, bare, "dae-8", "move_to_pose"
-    )

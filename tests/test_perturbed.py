@@ -255,11 +255,21 @@ def test_what_an_environment_draws_itself_stays_drawn(monkeypatch):
     np.testing.assert_allclose(masses(mass=2), 2 * drawn)
 
 
-def test_what_a_domain_refuses():
-    for name, value in (("wind", 1), ("delay", "soon"), ("delay", 0.5), ("delay", "3..1")):
-        assert name in refused(with_domain, TASKS["Pendulum-v1"], {name: value})
-    assert "dropped" in refused(with_domain, TASKS["Pendulum-v1"], {"dropped": 2})
-    assert "friction" in refused(with_domain, TASKS["Pendulum-v1"], {"friction": 2})
+@pytest.mark.parametrize(
+    "given",
+    [
+        *({"wind": 1}, {"delay": "soon"}, {"delay": 0.5}, {"delay": "3..1"}, {"dropped": 2}),
+        {"friction": 2},  # the pendulum has no model
+    ],
+    ids=str,
+)
+def test_what_a_domain_refuses(given):
+    assert next(iter(given)) in refused(with_domain, TASKS["Pendulum-v1"], given)
+
+
+def test_data_sets_are_of_one_domain():
+    task = with_domain(TASKS["face_direction"], {"delay": 1})
+    assert "delay=1" in refused(lambda: DataSettings(task=task, steps=10))
 
 
 def test_the_command_shows_what_a_policy_keeps(tmp_path):
@@ -268,34 +278,16 @@ def test_the_command_shows_what_a_policy_keeps(tmp_path):
     file = tmp_path / "table.json"
     told = jbrep(*played, "--perturb", "--out", file)
     assert told.exit_code == 0, told.output
-    *lines, empty, last = told.output.splitlines()
-    assert (empty, last) == ("", str(file))
-    assert max(map(len, lines)) <= 80
-    assert [line.split()[0] for line in lines[3:6]] == ["undisturbed", "noise=0.03", "noise=0.1"]
     rows = json.loads(file.read_text())["rows"]
     assert [row["name"] for row in rows][-2:] == ["push=0.1", "push=0.3"]
     assert rows[0]["returns"] == json.loads(jbrep(*played, "--json").output)["returns"]
     usual = np.mean(rows[0]["returns"])
     shares = [row["share"][0] for row in rows]
     assert shares == pytest.approx([np.mean(row["returns"]) / usual for row in rows])
-    assert rows[0]["share"] == [1, 1, 1]
     assert len(set(shares)) > 3
     one = json.loads(jbrep(*played, "--perturb", "delay=2", "--json").output)["rows"]
-    assert [row["name"] for row in one] == ["undisturbed", "delay=2"]
-    assert one[1] == next(row for row in rows if row["name"] == "delay=2")
-    assert "exists already" in mistake(*played, "--perturb", "--out", file)
-    assert "--perturb soon isn't a perturbation: write" in mistake(*played, "--perturb", "soon")
-    assert "--out is for the table of --perturb" in mistake(*played, "--out", tmp_path / "x")
-
-
-def test_a_robot_without_mujoco_has_the_rows_that_it_can_have():
-    played = ("evaluate-policy", "uniform", "--task", "Pendulum-v1", "--episodes", 1)
-    told = jbrep(*played, "--episode-steps", 5, "--perturb").output
-    assert "Pendulum-v1 has no friction, mass, push, body that could be changed" in told
-    assert "delay=3" in told
-    assert "push=" not in told
-    assert told.splitlines()[-1].endswith(" -")  # no shares of returns below 0
-    assert "push can't be changed in Pendulum-v1" in mistake(*played, "--perturb", "push=1")
+    assert one == [rows[0], next(row for row in rows if row["name"] == "delay=2")]
+    assert "--perturb soon" in mistake(*played, "--perturb", "soon")
 
 
 DRAWN = {**BODIES, "delay": "0..2", "noise": "0..0.2", "push": "0..0.5"}
@@ -339,12 +331,3 @@ def test_whoever_reads_a_run_knows_its_domain(runs):
     rows, _ = domains_of(player.task, ["delay=1"])
     assert [*rows] == ["undisturbed", "as in training", "delay=1"]
     assert rows["as in training"] == settings.environment.domain
-    assert settings.differing(settings.replace(environment=plain)) == (
-        "domain noise=0..0.2,delay=0..2,friction=0.5.... (now: none)"
-    )
-
-
-def test_what_can_not_be_with_a_domain():
-    task = with_domain(TASKS["face_direction"], {"delay": 1})
-    said = refused(lambda: DataSettings(task=task, steps=10))
-    assert said.startswith("face_direction draws its delay=1 in each episode: data sets are of")

@@ -1,7 +1,5 @@
 """Videos show the states that were simulated, at the time when they were."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +17,7 @@ from jbrep.envs.physics import physics_of
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import plain_model
 from jbrep.play.film import Film, Pace
-from jbrep.play.pictures import Camera, add_caption, band_height, find_camera
+from jbrep.play.pictures import Camera, band_height, find_camera
 from jbrep.play.sources import find_episode
 
 import_modules(["environments"])
@@ -70,8 +68,7 @@ def same(frame, other, tolerance):
 
 @needs_egl
 def test_an_mp4_from_the_command(tmp_path):
-    told = render(SAMPLE, "--out", tmp_path / "new" / "a.mp4").stdout
-    assert "a.mp4: 96 x 64 pixels, 0.2 s, 5 frames, 0.0 MB\n" in told
+    render(SAMPLE, "--out", tmp_path / "new" / "a.mp4")
     frames, form = read_mp4(tmp_path / "new" / "a.mp4")
     assert form == ("h264", "yuv420p", 25)
     assert [frame.shape for frame in frames] == [(64, 96, 3)] * 5
@@ -91,8 +88,7 @@ def test_a_gif_from_the_command_loops(tmp_path):
 
 
 @needs_egl
-@pytest.mark.parametrize("name", ["overhead", "tracking", "egocentric"])
-def test_a_frame_shows_what_mujoco_renders(name, episode):
+def test_a_frame_shows_what_mujoco_renders(episode):
     model = plain_model()
     data = mujoco.MjData(model)
     arrays = episode.motion.arrays
@@ -100,9 +96,9 @@ def test_a_frame_shows_what_mujoco_renders(name, episode):
     data.mocap_pos[:], data.mocap_quat[:] = arrays["mocap_pos"][40], arrays["mocap_quat"][40]
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, 120, 160) as renderer:
-        renderer.update_scene(data, name)
+        renderer.update_scene(data, "tracking")
         expected = renderer.render()
-    with Camera(name, 160, 120) as camera:
+    with Camera("tracking", 160, 120) as camera:
         film = Film([episode, episode], camera, Pace(fps=5, seconds=0.6))
         frame = np.asarray(list(film.frames())[2])
     below = band_height(120)
@@ -113,7 +109,7 @@ def test_a_frame_shows_what_mujoco_renders(name, episode):
 
 
 @needs_egl
-@pytest.mark.parametrize("task", ["Hopper-v5", "Reacher-v5", "dm_control/cheetah-run-v0"])
+@pytest.mark.parametrize("task", ["Reacher-v5", "dm_control/cheetah-run-v0"])
 def test_any_robot_of_mujoco_is_filmed(task):
     episode = find_episode("uniform", 0, describe(task, max_episode_steps=30))
     with Camera(None, *SIZE) as camera:
@@ -143,15 +139,9 @@ def test_what_can_t_be_filmed(camera):
 
 
 @needs_egl
-@pytest.mark.parametrize(
-    ("name", "named"),
-    [("Sledge", "no MuJoCo"), ("Moody", "no MuJoCo")],
-)
-def test_what_nobody_draws_is_one_line(name, named, tmp_path):
-    out = tmp_path / "new" / "a.mp4"
-    told = render("uniform", "--task", f"Sledges/{name}-v0", "--out", out)
-    assert told.exit_code == 2
-    assert named in told.stderr.splitlines()[-1]
+def test_what_nobody_draws_is_refused(tmp_path):
+    told = render("uniform", "--task", "Sledges/Sledge-v0", "--out", tmp_path / "new" / "a.mp4")
+    assert (told.exit_code, "no MuJoCo" in told.stderr) == (2, True)
     assert not list(tmp_path.iterdir())
 
 
@@ -166,20 +156,6 @@ def test_speed_and_frames(pace, frames, last, episode, camera):
     assert film.seconds == pytest.approx(10 / pace.speed)
 
 
-def test_a_caption_keeps_to_its_band_and_to_its_room():
-    for width, height in ((64, 64), (320, 240), (1280, 960)):
-        picture = Image.new("RGB", (width, height), "green")
-        add_caption(picture, "runs/a" * 50, "return 712    9.96 s")
-        pixels = np.asarray(picture)
-        assert (pixels[band_height(height) :] == (0, 128, 0)).all()
-        assert (pixels[: band_height(height)] != (0, 128, 0)).any(axis=2).all()
-    for name, shown in ((f"{'runs' * 9}/sac/seed-0", "…/sac/seed-0"), ("a", "a")):
-        one, other = (Image.new("RGB", (240, 180)) for _ in range(2))
-        add_caption(one, name, "return 712    9.96 s")
-        add_caption(other, shown, "return 712    9.96 s")
-        assert one == other
-
-
 @needs_egl
 def test_a_mistake_is_one_line_and_exit_code_2(tmp_path, monkeypatch):
     data = Path("data").resolve()
@@ -189,24 +165,10 @@ def test_a_mistake_is_one_line_and_exit_code_2(tmp_path, monkeypatch):
     for named, *arguments in (
         *(("a.avi", "--out", "a.avi"), ("there.mp4", "--out", "there.mp4")),
         *(("camera", "--camera", "side"), ("640x480", "--size", "640")),
-        *(("641x480", "--size", "641x480"), ("even", "--size", "9000x9000")),
-        *(("fps", "--fps", 0), ("speed", "--speed", "nan"), ("seconds", "--seconds", 0)),
-        *(("start", "--episode", 1, "uniform"), ("episode 4", "--episode", 4)),
-        *(("nowhere", "nowhere"), ("wide", "--size", "3840x64", "uniform", "uniform")),
+        *(("641x480", "--size", "641x480"), ("fps", "--fps", 0), ("speed", "--speed", "nan")),
+        *(("episode 4", "--episode", 4), ("wide", "--size", "3840x64", "uniform", "uniform")),
     ):
         result = render(SAMPLE, "--task", "move_to_pose", "--out", "a.mp4", *arguments)
         assert result.exit_code == 2
         assert named in result.stderr.splitlines()[-1]
         assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "there.mp4"]
-
-
-def test_missing_opengl_is_one_line(tmp_path):
-    """In a process of its own: MuJoCo looks for it once, when imported."""
-    command = ("render", SAMPLE, "--out", str(tmp_path / "a.mp4"))
-    code = f"from jbrep.cli import main; main({command})"
-    result = subprocess.run(
-        [sys.executable, "-c", code], env={"MUJOCO_GL": "disable"}, capture_output=True, text=True
-    )
-    assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
-    assert "EGL" in result.stderr
-    assert not list(tmp_path.iterdir())

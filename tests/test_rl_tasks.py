@@ -1,7 +1,5 @@
 """Runs on tasks of any kind: sizes, terminations, failures, resuming by replay, version 1."""
 
-import csv
-
 import cart
 import numpy as np
 import pytest
@@ -32,65 +30,38 @@ from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.presets import ALGORITHMS, get_preset
 
 CART = describe(cart.ID)
-PENDULUM, HOPPER = describe("Pendulum-v1", max_episode_steps=50), describe("Hopper-v5")
+HOPPER = describe("Hopper-v5")
 FAILING = CART.replace(arguments={"fail_seed": training_seed(0) + 3})
 
 
-SHORTER = {
-    "n_steps": 16,
-    "train_freq": 16,
-    "learning_starts": 50,
-    "gradient_steps": 4,
-    "batch_size": 32,
-}
+SHORTER = {"n_steps": 16, "train_freq": 16, "gradient_steps": 4}
+SMALL = {"net_arch": [8], "learning_starts": 50, "batch_size": 16}
 
 
-@pytest.fixture
-def short_rollouts(monkeypatch):
-    """The paper's settings with shorter rollouts and fewer updates."""
-    for known in ALGORITHMS.values():
-        preset = known.presets["paper"]
-        kwargs = preset.algorithm_kwargs
-        shorter = {name: value for name, value in SHORTER.items() if name in kwargs}
-        quick = preset.replace(algorithm_kwargs={**kwargs, **shorter})
-        monkeypatch.setitem(known.presets, "paper", quick)
+def shorter(algorithm):
+    """Shorter rollouts and fewer updates, where the algorithm has such settings."""
+    known = ALGORITHMS[algorithm].presets["paper"].algorithm_kwargs
+    return {name: n for name, n in (SMALL | SHORTER).items() if name in {*known, "net_arch"}}
 
 
-def episodes_of(folder):
-    with (folder / EPISODES).open() as file:
-        return [{n: float(v) for n, v in row.items()} for row in csv.DictReader(file)]
-
-
-@pytest.mark.parametrize(
-    ("task", "algorithm"),
-    [*((HOPPER, each) for each in ALGORITHMS), (PENDULUM, "sac")],
-    ids=lambda given: getattr(given, "slug", given),
-)
-def test_every_algorithm_changes_its_weights_on_any_task(algorithm, task, short_rollouts, tmp_path):
-    run = Run.of(task=task, algorithm=algorithm, steps=150, preset="paper", **ONE_EACH)
-    result = train(run, tmp_path)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_algorithm_changes_its_weights(algorithm, tmp_path):
+    how = {"preset": "paper", "overrides": shorter(algorithm), **ONE_EACH}
+    result = train(Run.of(HOPPER, algorithm, steps=150, **how), tmp_path)
     assert result.status == "finished", result.reason
-    assert result.settings.task == task.name
     playing = load_run(tmp_path)
-    assert playing.task == task
-    action = playing.begin(task, [0])(np.zeros((1, task.size)))
-    assert action.shape == (1, task.action_size)
+    action = playing.begin(HOPPER, [0])(np.zeros((1, HOPPER.size)))
+    assert action.shape == (1, HOPPER.action_size)
     before, after = load_untrained(tmp_path).policy.state_dict(), playing.policy.state_dict()
     assert any(not before[name].equal(after[name]) for name in before)
-    episodes = episodes_of(tmp_path)
-    assert all(row["diverged"] == 0 for row in episodes)
-    if task is PENDULUM:
-        assert all(row.episode_return < 0 for row in read_evaluations(tmp_path))
-    elif episodes:
-        assert max(row["length"] for row in episodes) < HOPPER.max_episode_steps
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-def test_the_units_of_actions_do_not_matter(algorithm, short_rollouts, tmp_path):
+def test_the_units_of_actions_do_not_matter(algorithm, tmp_path):
     """Pulses of 1,000 to 2,000 us would be clipped nearly always, were they not scaled."""
-    played = []
+    played, how = [], {"overrides": shorter(algorithm), "steps": 160}
     for name in (cart.ID, cart.SERVO):
-        run = Run.of(name, algorithm=algorithm, steps=160, evaluation_episodes=2, final_episodes=2)
+        run = Run.of(name, algorithm, evaluation_episodes=2, final_episodes=2, **how)
         assert train(run, tmp_path / str(len(played))).status == "finished"
         rows = read_evaluations(tmp_path / str(len(played)))
         played.append([row.episode_return for row in rows])
@@ -112,24 +83,8 @@ def test_evaluations_are_in_the_order_of_their_starts():
     np.testing.assert_allclose(together, alone, rtol=1e-4)
 
 
-def test_training_is_told_of_terminations(tmp_path):
-    """It must not take the value of a state after which an episode ended for good."""
-    encoder = find("full", HOPPER)
-    chosen = get_preset("modern", "sac")
-    agent = make_agent("sac", chosen, make_env(HOPPER, chosen, 0, encoder), 0)
-    agent.learn(200)
-    buffer = agent.replay_buffer
-    assert buffer.dones[:200].any()
-    assert not buffer.timeouts[:200].any()
-
-
-@pytest.mark.parametrize(
-    ("task", "algorithm"),
-    [(PENDULUM, "a2c"), (HOPPER, "sac")],
-    ids=lambda given: getattr(given, "slug", given),
-)
-def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, task, tmp_path):
-    run = Run.of(task=task, algorithm=algorithm, preset="modern", steps=320, **ONE_EACH)
+def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(tmp_path):
+    run = Run.of(HOPPER, "sac", preset="modern", overrides=SMALL, steps=320, **ONE_EACH)
     one, other = tmp_path / "one", tmp_path / "other"
     train(run, one)
     steps = []
@@ -144,8 +99,7 @@ def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
     run = Run.of(task=FAILING, algorithm="a2c", steps=800, preset="paper", **ONE_EACH)
     result = train(run, tmp_path)
     assert result.status == FAILED
-    where = f"failed at step 7 of the episode with seed {training_seed(0) + 3}"
-    assert result.reason.startswith(rf"Test/Cart-v0 {where}: RuntimeError: the motor\x1b[2J is")
+    assert f"at step 7 of the episode with seed {training_seed(0) + 3}" in result.reason
     assert result.reason.endswith(" after 48 steps")  # of 8 lanes
     assert read_run(tmp_path) == result
     assert [row.step for row in read_evaluations(tmp_path)] == [0]
@@ -172,7 +126,7 @@ def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
 
 
 def test_what_was_learned_outlives_an_environment_that_fails(tmp_path, monkeypatch):
-    run = Run.of(task=CART, algorithm="sac", steps=160, preset="modern", **ONE_EACH)
+    run = Run.of(CART, "sac", steps=160, preset="modern", overrides=SMALL, **ONE_EACH)
     session = Session(save_every=0, keep_checkpoint=True)
     whole = train(run, tmp_path / "whole", session)
     count, step = iter(range(1 << 20)), Lanes.step
@@ -192,12 +146,7 @@ def test_what_was_learned_outlives_an_environment_that_fails(tmp_path, monkeypat
 
 
 def test_an_environment_that_is_not_reproducible(tmp_path):
-    """The command says so at its start; a run that was stopped isn't resumed to something else."""
-    rl = ("rl", "--task", cart.ID, "--env", "drifts=true", "--algorithm", "a2c", "--steps", 80)
-    told = jbrep(*rl, "--evaluation-episodes", 1, "--out", tmp_path / "run")
-    assert told.exit_code == 0, told.output
-    assert told.stderr.startswith("Note: Test/Cart-v0 is not reproducible: ")
-    assert told.stderr.count("\n") == 1
+    """A run that was stopped isn't resumed to something else."""
     drifting = describe(cart.ID, {"drifts": True})
     run = Run.of(task=drifting, algorithm="a2c", steps=80, preset="paper", **ONE_EACH)
     with pytest.raises(StoppedError):
@@ -210,7 +159,7 @@ def test_an_environment_that_is_not_reproducible(tmp_path):
 @pytest.mark.parametrize(
     ("algorithm", "overrides"),
     [
-        ("tqc", {"learning_starts": 50}),
+        ("tqc", SMALL),
         ("a2c", {"num_envs": 1}),  # one robot, whose episodes last 40 steps
     ],
 )
@@ -234,7 +183,7 @@ def test_a_run_goes_on_as_one_that_had_more_steps_at_first(algorithm, overrides,
 
 def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(tmp_path, monkeypatch):
     settings = ("rl", "--task", cart.ID, "--algorithm", "sac", "--preset", "modern")
-    settings += ("--set", "learning_starts=50", "--evaluate-every", 80)
+    settings += ("--set", "net_arch=[8]", "--set", "batch_size=16", "--evaluate-every", 80)
     settings += ("--evaluation-episodes", 2, "--final-episodes", 3, "--out")
     folder, whole = tmp_path / "grown", tmp_path / "whole"
     assert jbrep(*settings, folder, "--steps", 160).exit_code == 0

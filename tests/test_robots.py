@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from importlib import import_module, reload
+from importlib import import_module
 from pathlib import Path
 
 import arms
@@ -12,18 +12,14 @@ import numpy as np
 import pytest
 from arms import STEPS, Arm
 from command import jbrep, mistake, refused
-from gymnasium.envs.registration import EnvSpec
 from small import contents
 
 from jbrep.collecting import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import find_problems
-from jbrep.encoders.wrapper import Encoded
 from jbrep.envs import describe, make
 from jbrep.envs.autoreset import AutoresetLanes
-from jbrep.envs.make import make_env
 from jbrep.envs.names import import_modules
-from jbrep.errors import InputError
 from jbrep.rl.files import read_run
 
 import_modules(["arms", "environments"])
@@ -107,41 +103,6 @@ def test_an_episode_is_played_again_before_a_data_set_grows(tmp_path, monkeypatc
     assert len(contents(tmp_path / "d")) == len(before)
 
 
-@pytest.fixture
-def own_module(tmp_path, monkeypatch):
-    """A module with a robot."""
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("jbrep.envs.names._imported", [])  # other tests' workers lack it
-    (tmp_path / "robot42.py").write_text(
-        "import gymnasium\nfrom environments import Sledge\n\nGEAR = 0.5\n\n\n"
-        "class Robot(Sledge):\n    def step(self, action):\n        return super().step("
-        "action * self.action_space.high.dtype.type(GEAR))\n\n\n"
-        "gymnasium.register('Own/Robot-v0', 'robot42:Robot', max_episode_steps=30)\n"
-    )
-    yield tmp_path / "robot42.py"
-    sys.modules.pop("robot42", None)
-    gymnasium.registry.pop("Own/Robot-v0", None)
-
-
-def test_a_run_of_another_robot_is_not_resumed(own_module, tmp_path):
-    """Neither one that was stopped nor one that has ended, nor a data set extended."""
-    robot = ("--task", "robot42:Own/Robot-v0")
-    run = ("rl", *robot, "--algorithm", "a2c", "--set", "num_envs=1", "--evaluation-episodes", 1)
-    run = (*run, "--final-episodes", 1, "--steps", 40, "--out", tmp_path / "run")
-    data = ("collect", *robot, "--threads", 1, "--out", tmp_path / "d")
-    assert jbrep(*run).exit_code == 0
-    assert jbrep(*data, "--steps", 40).exit_code == 0
-    assert [*read_run(tmp_path / "run").settings.environment.files] == ["module robot42"]
-    with pytest.MonkeyPatch.context() as elsewhere:
-        elsewhere.delitem(gymnasium.registry, "Own/Robot-v0")
-        assert "add --import robot42" in mistake("evaluate-policy", tmp_path / "run")
-    own_module.write_text(own_module.read_text().replace("0.5", "0.25"))
-    gymnasium.registry.pop("Own/Robot-v0")
-    reload(sys.modules["robot42"])
-    assert "files.module robot42" in mistake(*run)
-    assert "files.module robot42" in mistake(*data, "--steps", 80)
-
-
 # what 32 bits hold
 
 
@@ -162,26 +123,7 @@ def test_a_clock_that_32_bits_swallow_is_told_and_shifted(tmp_path):
     clock = 0.25 + 0.02 * dataset["step"][:]
     np.testing.assert_allclose(dataset["clock"][:], clock, atol=1e-6)
     assert dataset.task.offsets == {"clock": 1764000000.0}
-    make.close_all()
-    env = make_env(arms.ID, {"log": str(tmp_path / "log"), "clock": 1764000000.25})
-    seen, _ = Encoded(env, lambda rows: rows, dataset.task).reset(seed=0)
-    env.close()
-    assert seen[order.index("clock")] == 0.25
     assert jbrep("data", "verify", tmp_path / "e", "--replay", 1).exit_code == 0
-
-
-@pytest.mark.parametrize("made", [{"id": "Mine-v0"}, None])
-def test_a_class_describes_itself(made, monkeypatch):
-    """As a task, and no other one."""
-
-    class Mine(gymnasium.Env):
-        @staticmethod
-        def describe(arguments, max_episode_steps):
-            return made or describe("Pendulum-v1")
-
-    monkeypatch.setitem(gymnasium.registry, "Mine-v0", EnvSpec("Mine-v0", Mine))
-    with pytest.raises(InputError, match="describe must return a jbrep"):
-        describe("Mine-v0")
 
 
 # one robot, which fails
@@ -191,16 +133,12 @@ def test_one_instance_describes_collects_and_evaluates(tmp_path):
     robot = arm(tmp_path)
     told = jbrep("env", *robot[1:], "--json")
     assert json.loads(told.stdout)["id"] == arms.ID  # what the robot prints goes elsewhere
-    assert "torque off" in told.stderr
     assert closed(tmp_path)
     data = tmp_path / "d"
     assert jbrep("collect", *robot, "--steps", 60, "--threads", 1, "--out", data).exit_code == 0
     told = jbrep("evaluate-policy", "uniform", *robot, "--episodes", 3, "--json")
     assert len(json.loads(told.stdout)["returns"]) == 3
     assert events(tmp_path) == "oc" * 3
-    told = jbrep("evaluate-policy", "uniform", *robot, "--episodes", 3, "--threads", 1)
-    assert told.exit_code == 0
-    assert events(tmp_path) == "oc" * 4
 
 
 @pytest.mark.parametrize(("algorithm", "drifts"), [("sac", False), ("ppo", True)])
@@ -218,17 +156,11 @@ def test_training_and_evaluation_share_the_one_robot(algorithm, drifts, tmp_path
     assert told.exit_code == 0, told.output
     assert events(tmp_path) == "oc"
     assert "standing still" not in told.output  # no policy that doesn't look drives it
-    settings = read_run(tmp_path / "run").settings
-    assert (settings.preset, settings.hyperparameters.num_envs) == ("modern", 1)
     rows = (tmp_path / "run" / "evaluations.csv").read_text().splitlines()[1:]
     steps = list(dict.fromkeys(int(row.split(",")[0]) for row in rows))
     assert steps == [0, 50, 100, 125, 128]
     assert len(rows) == 11
     assert len(begun) == 4  # not after the last
-    of_many = (*run[:-2], "--threads", 2, "--set", "num_envs=1", "--preset", "modern")
-    told = jbrep(*of_many, "--out", tmp_path / "run")
-    assert told.exit_code == 2
-    assert "one_robot true (now: false)" in " ".join(told.output.split())
 
 
 def test_what_fails_is_closed_kept_and_tried_again(tmp_path):
@@ -253,9 +185,6 @@ def test_what_fails_is_closed_kept_and_tried_again(tmp_path):
     assert told.exit_code == 0, told.output
     assert "no answer; retrying" in told.stderr
     assert contents(tmp_path / "d") == contents(tmp_path / "e")
-    Arm.steps_of_all = 0  # in the episodes that a shard's size is judged by
-    told = jbrep(*command[:-1], tmp_path / "f", "--retries", 1)
-    assert (told.exit_code, told.stderr.count("retrying")) == (0, 1), told.output
     assert closed(tmp_path)
 
 
@@ -278,13 +207,6 @@ def test_evaluations_and_training_go_on_after_failures(tmp_path):
     assert told.stderr.count("no answer; retrying") == 2
     assert read_run(tmp_path / "run").status == "finished"
     assert closed(tmp_path)
-    Arm.steps_of_all = 0
-    told = jbrep(*run, "--out", tmp_path / "failed")
-    assert (told.exit_code, "the run failed: Arms/Arm-v0 failed at step" in told.output) == (
-        1,
-        True,
-    )
-    assert closed(tmp_path)
 
 
 # readings that are missing
@@ -294,12 +216,9 @@ def test_missing_readings_are_held_or_end_an_episode_and_counted(tmp_path):
     robot = arm(tmp_path, gaps=[4, 5, 9])
     command = ("collect", *robot, "--steps", 30, "--threads", 1, "--out", tmp_path / "d")
     told = jbrep(*command)
-    assert told.exit_code == 2
-    assert "gave an observation or reward that is not finite in 32 bits, at step 4" in told.output
-    assert "--missing" in told.output
+    assert (told.exit_code, "at step 4" in told.output) == (2, True)
     told = jbrep(*command[:-1], tmp_path / "held", "--missing", "hold:2")
     assert told.exit_code == 0, told.output
-    assert "12 missing readings" in told.output  # an angle and a reward, three times, two episodes
     held = Dataset(tmp_path / "held")
     angle = held["angle"][:STEPS]
     assert angle[3] == angle[4] == angle[5] != angle[6]
@@ -309,7 +228,7 @@ def test_missing_readings_are_held_or_end_an_episode_and_counted(tmp_path):
     assert held.episodes["missing"].tolist() == [6, 6]
     assert jbrep("data", "verify", tmp_path / "held", "--replay", 2).exit_code == 0
     told = jbrep(*command[:-1], tmp_path / "x", "--missing", "hold:1")
-    assert (told.exit_code, "not finite in 32 bits, at step 5" in told.output) == (2, True)
+    assert (told.exit_code, "at step 5" in told.output) == (2, True)
     told = jbrep(*command[:-1], tmp_path / "cut", "--missing", "skip")
     assert told.exit_code == 0, told.output
     cut = Dataset(tmp_path / "cut")
@@ -318,8 +237,6 @@ def test_missing_readings_are_held_or_end_an_episode_and_counted(tmp_path):
     np.testing.assert_array_equal(cut.episodes["final_observation"][0], held["observation"][3])
     assert not list(find_problems(tmp_path / "cut"))
     assert jbrep("data", "verify", tmp_path / "cut", "--replay", 2).exit_code == 0
-    told = jbrep("env", *robot[1:], "--missing", "drop")
-    assert (told.exit_code, "missing" in told.output) == (2, True)
 
 
 # what environments give

@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.stats import beta, median_abs_deviation, ttest_1samp, ttest_rel
+from scipy.stats import beta, median_abs_deviation, ttest_rel
 
 from jbrep.errors import InputError
 from jbrep.stats.analysis import analyse
@@ -55,12 +55,6 @@ def words(found):
     return [verdict.verdict for verdict in found]
 
 
-def test_without_bounds_the_interval_of_a_mean_is_student_s():
-    values = drawn(3, 2, 9, 0)
-    theirs = ttest_1samp(values, 0).confidence_interval(0.9)
-    np.testing.assert_allclose(mean_within(values, Bounds(), 0.9)[1:], theirs)
-
-
 @pytest.mark.parametrize("bounds", [RETURNS, Bounds(0), Bounds(-np.inf, 1000)])
 def test_intervals_keep_to_what_is_possible(bounds):
     for values in (np.array([1, 2, 900.0]), np.array([999, 998, 100.0]), np.array([0, 1000.0])):
@@ -104,15 +98,15 @@ def test_the_interval_of_a_ratio_of_spreads_is_what_the_test_keeps():
     value, low, high = ratio_of_spreads(curves, 0.95, 0)
     assert low < value < high < 1
     assert spread_p(curves, 0) < 0.05
-    twice = ratio_of_spreads(replace_x(curves, 2 * x), 0.95, 0)
+    twice = ratio_of_spreads(curves._replace(x=2 * x), 0.95, 0)
     np.testing.assert_allclose(twice, 2 * np.array([value, low, high]), rtol=2e-3)
     equal = Curves(y, y + 100, np.full(9, 1 / 9), 1.0)
     assert ratio_of_spreads(equal, 0.95, 0).value == pytest.approx(1)
     assert spread_p(equal, 0) > 0.9
-
-
-def replace_x(curves, x):
-    return curves._replace(x=x)
+    one_step = Curves(x[:12, :1], y[:12, :1] / 2, np.ones(1), 0.01)
+    p = spread_p(one_step, 0)  # and the interval at other levels, as of many claims, agrees with it
+    assert ratio_of_spreads(one_step, 1 - 1.2 * p, 0).high < 1
+    assert ratio_of_spreads(one_step, 1 - 0.8 * p, 0).high > 1
 
 
 def measured(full, other, seeds=None):
@@ -141,8 +135,6 @@ def test_runs_are_paired_by_seed_whatever_their_order():
     theirs = ttest_rel(*finals).confidence_interval(0.95)
     np.testing.assert_allclose(found.interval[1:], theirs)
     assert found.estimate.value == pytest.approx(30)
-    few = verdicts(full, other[:-1], ALL[:1])[0]
-    assert few.reason == "11 of 12 runs on dae-12 have ended"
 
 
 def test_curves_at_the_ceiling_spread_less():
@@ -160,17 +152,6 @@ def test_agents_that_all_solve_a_task_have_learnt():
     assert found[0].verdict == "contradicted"
     alike = verdicts(arm("full", [1000.0] * 16), arm("dae-12", [1000.0] * 16))
     assert (alike[0].verdict, alike[0].reason) == ("undecided", "nothing varies from run to run")
-
-
-def test_an_interval_of_a_test_agrees_with_its_p():
-    """Also at the level of many claims."""
-    random = np.random.default_rng(0)
-    x, y = random.normal(0, 1, (12, 1)), random.normal(0, 9, (12, 1))
-    curves = Curves(x, y, np.ones(1), 0.01)
-    p = spread_p(curves, 0)
-    assert p < 0.02
-    assert ratio_of_spreads(curves, 1 - 1.2 * p, 0).high < 1
-    assert ratio_of_spreads(curves, 1 - 0.8 * p, 0).high > 1
 
 
 def of_encoders(per_encoder=2, encoders=8, name="dae-12"):
@@ -201,7 +182,7 @@ def test_the_last_evaluation_is_the_final_return():
     full = [replace(run, final=np.full(100, 900.0)) for run in full]
     runs = [curve(800, seed=seed, final=np.arange(700, 800.0), name="dae-12") for seed in (0, 1)]
     assert measured(full, runs).x.final == pytest.approx(749.5)
-    failed = curve(800, seed=2, failed_at=70_000, name="dae-12")
+    failed = curve(800, seed=2, failed_at=70_000, name="dae-12", final=np.full(20, 850.0))
     np.testing.assert_allclose(measured(full, [*runs, failed]).x.final, [749.5, 749.5, 0])
 
 
@@ -285,12 +266,10 @@ def test_there_is_no_verdict_before_all_planned_runs_have_ended():
     ("rules", "field"),
     [
         ({"margin": 0}, "margin"),
-        ({"error": 1.0}, "error"),
         ({"reference": float("nan")}, "reference"),
         ({"claims": ("dae-8 slower than full",)}, "claims"),
         ({"claims": ("full better than full",)}, "claims"),
         ({"claims": ("full better",)}, "claims"),  # than the baseline, which it is
-        ({"claims": ("dae-8 faster",)}, "claims"),
         ({"claims": ("dae-8 better", "dae-8 better than full")}, "claims"),
     ],
 )
@@ -398,18 +377,6 @@ def test_no_step_comes_to_a_share_of_a_gain_that_curves_do_not_show():
     names = ("steps_to_50_percent", "steps_to_90_percent")
     assert all(np.isnan(group.thresholds[name]) for name in names)
     assert group.labels[0].learnt == "yes"
-
-
-def test_a_failed_run_counts_as_failed_whatever_it_was_played_from_at_its_end():
-    ends = drawn(850, 20, 16, 0)
-    good = [
-        replace(run, final=np.full(20, end))
-        for run, end in zip(arm("full", ends), ends, strict=True)
-    ]
-    bad = arm("dae-12", drawn(850, 20, 16, 1), final=np.full(20, 850.0), failed_at=90_000)
-    verdict, *_ = verdicts(good, bad)
-    assert verdict.verdict == "contradicted"
-    assert verdict.estimate.value == pytest.approx(-850, abs=0.02)
 
 
 def test_there_is_no_verdict_where_it_is_not_known_what_gains_count_over():

@@ -10,7 +10,6 @@ from gymnasium import spaces
 from jbrep import JitterbugVecEnv
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
-from jbrep.envs.lanes import NonFiniteActionError
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 
@@ -18,15 +17,6 @@ FACE = describe("face_direction", max_episode_steps=100)
 CART = describe(cart.ID)
 MANY = (FACE, CART, describe("Pendulum-v1", max_episode_steps=30), describe("Hopper-v5"))
 each_task = pytest.mark.parametrize("task", MANY, ids=lambda task: task.name)
-
-
-class Halves:
-    """Sees each pair of features as their mean."""
-
-    latent_size = 8
-
-    def __call__(self, observation):
-        return observation.reshape(len(observation), 8, 2).mean(axis=2)
 
 
 def actions(steps, lanes, task=FACE):
@@ -89,63 +79,6 @@ def test_the_middle_of_an_episode_is_restored_to_the_same_bits(task):
                 np.testing.assert_array_equal(ours, theirs)
 
 
-@pytest.mark.parametrize(("lanes", "threads"), [(3, 1), (8, None)])
-def test_lane_i_has_the_episodes_of_seed_plus_i(lanes, threads):
-    def tape(environment, lane, drive):
-        rows = [environment.reset()[lane]]
-        for action in drive:
-            observation, reward, _, _ = environment.step(
-                np.repeat(action[None], environment.num_envs, 0)
-            )
-            rows.append(np.append(observation[lane], reward[lane]))
-        return np.concatenate(rows)
-
-    drive = actions(60, 1)[:, 0]
-    task = describe("move_in_direction", max_episode_steps=40)
-    alone = JitterbugVecEnv(task, 1, seed=10 + lanes - 1, num_threads=1)
-    among = JitterbugVecEnv(task, lanes, seed=10, num_threads=threads)
-    np.testing.assert_array_equal(tape(alone, 0, drive), tape(among, lanes - 1, drive))
-
-
-def test_the_encoder_sees_observations_in_physical_units_also_terminal_ones():
-    plain, coded = JitterbugVecEnv(FACE, 2), JitterbugVecEnv(FACE, 2, encoder=Halves())
-    assert coded.observation_space.shape == (8,)
-
-    def check(latent, scaled):
-        expected = Halves()(FACE.unscale(scaled.astype(float)))
-        np.testing.assert_allclose(latent, expected, rtol=1e-5, atol=1e-4)
-
-    check(coded.reset(), plain.reset())
-    for action in actions(100, 2):
-        observation, _, _, infos = plain.step(action)
-        latent, _, done, coded_infos = coded.step(action)
-        check(latent, observation)
-    assert done.all()
-    for info, coded_info in zip(infos, coded_infos, strict=True):
-        check(coded_info["terminal_observation"][None], info["terminal_observation"][None])
-
-
-def test_a_lane_that_diverges_is_flagged_and_the_others_go_on():
-    one, other = JitterbugVecEnv("face_direction", 3), JitterbugVecEnv("face_direction", 3)
-    one.reset(), other.reset()
-    drive = actions(20, 3)
-    for action in drive[:10]:
-        before = one.step(action)[0]
-        other.step(action)
-    one.lanes.envs.simulation.readings.qvel[1] = np.nan
-    for step, action in enumerate(drive[10:]):
-        observation, reward, done, infos = one.step(action)
-        expected = other.step(action)
-        np.testing.assert_array_equal(observation[[0, 2]], expected[0][[0, 2]])
-        assert done.tolist() == [False, step == 0, False]
-        if done.any():
-            assert infos[1]["non_finite"] is True
-            assert infos[1]["TimeLimit.truncated"] is True
-            assert reward[1] == 0
-            np.testing.assert_array_equal(infos[1]["terminal_observation"], before[1])
-        assert np.isfinite(observation).all()
-
-
 def test_the_environment_gets_actions_within_its_bounds():
     """Scaled to them from [-1, 1] they could round to beyond; the cart refuses those."""
     environment = JitterbugVecEnv(CART, 1)
@@ -160,24 +93,24 @@ def test_the_environment_gets_actions_within_its_bounds():
     np.testing.assert_array_equal(FACE.unscale_action(drawn), drawn)  # no bit is lost
 
 
-def test_mistakes_are_named():
-    with pytest.raises(InputError, match=r"unknown task 'fly': choose one of move_from_origin"):
-        JitterbugVecEnv("fly", 1)
-    with pytest.raises(InputError, match="the number of lanes is 0: it must be at least 1"):
-        JitterbugVecEnv("face_direction", 0)
-    with pytest.raises(InputError, match="is described with its time limit"):
-        JitterbugVecEnv(FACE, 1, max_episode_steps=7)
-    with pytest.raises(InputError, match="made for face_direction, not for Test/Cart-v0"):
-        JitterbugVecEnv(CART, 1, encoder=find("dae-8", FACE))
+class Liar:
+    """Says that it gives 7 numbers, and gives 8."""
 
-    class Liar(Halves):
-        latent_size = 7
+    latent_size = 7
 
-    with pytest.raises(InputError, match="latents of 8 numbers, but its latent_size is 7"):
-        JitterbugVecEnv("face_direction", 2, encoder=Liar())
-    environment = JitterbugVecEnv("face_direction", 2)
-    environment.reset()
-    with pytest.raises(InputError, match=r"shape \(2,\)"):
-        environment.step(np.zeros(2))
-    with pytest.raises(NonFiniteActionError, match="not finite"):
-        environment.step(np.full((2, 1), np.nan))
+    def __call__(self, observation):
+        return observation[:, :8]
+
+
+@pytest.mark.parametrize(
+    ("task", "how", "named"),
+    [
+        ("face_direction", {"num_envs": 0}, "at least 1"),
+        (FACE, {"num_envs": 1, "max_episode_steps": 7}, "time limit"),
+        (CART, {"num_envs": 1, "encoder": find("dae-8", FACE)}, "made for face_direction"),
+        (FACE, {"num_envs": 2, "encoder": Liar()}, "latent_size is 7"),
+    ],
+)
+def test_mistakes_are_named(task, how, named):
+    with pytest.raises(InputError, match=named):
+        JitterbugVecEnv(task, **how)

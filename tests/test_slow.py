@@ -121,9 +121,9 @@ def test_vamp_is_the_canonical_correlation_that_the_actions_leave(moved):
     np.testing.assert_allclose(code.std(axis=0), 1 / 3, atol=1e-5)
 
 
-@pytest.mark.parametrize("weights", [{"values": 0}, {"changes": 2, "reward": 0.5}])
-def test_the_linear_forward_code_is_reduced_rank_regression(data, weights):
+def test_the_linear_forward_code_is_reduced_rank_regression(data):
     horizons, regressors, targets = (1, 4), [], []
+    weights = {"changes": 2, "reward": 0.5}
     turn = 2 * math.pi / data.scaler.half_width
     angles = np.array([feature.is_angle for feature in data.task.features])
     changes, values, reward = (weights.get(w, 1) for w in ("changes", "values", "reward"))
@@ -174,7 +174,7 @@ def test_features_that_depend_on_others_are_named(tmp_path):
     extra = system(tmp_path / "sum", extra=lambda rows: rows[:, :1] - 2 * rows[:, 2:3])
     names = extra.task.feature_names
     for kind in ("slow", "vamp", "linear-forward"):
-        with pytest.raises(InputError, match=f"{names[0]}, {names[2]}, {names[4]} in .*singular"):
+        with pytest.raises(InputError, match=f"{names[0]}, {names[2]}, {names[4]}"):
             made(extra, kind, latent=2)
     assert made(extra.rescaled(without=names[4:]), "slow", latent=2)
 

@@ -70,24 +70,12 @@ def test_one_of_the_dm_control_suite():
     assert task.feature_names[2:4] == ("position_2", "velocity_0")
     lanes = Lanes(task.replace(max_episode_steps=3), 1)
     lanes.reset([0], [episode_seed(task, 2046, 0)])
-    most = r"seeds of 31 bits: .* be at most 2,046, with at most 1,048,576 episodes"
-    with pytest.raises(InputError, match=most):
-        episode_seed(task, 2047, 0)
-    with pytest.raises(InputError, match="takes seeds of 31 bits"):
-        episode_seed(task, 0, 1 << 20)
+    for root, number in ((2047, 0), (0, 1 << 20)):
+        with pytest.raises(InputError, match="seeds of 31 bits"):
+            episode_seed(task, root, number)
     few = {episode_seed(task, root, n) for root in (0, 1, 2046) for n in (0, 1, 2**20 - 1)}
     assert len(few) == 9
     assert max(few) < 2**31
-
-
-def test_an_environment_of_another_package():
-    task = describe(SLEDGE)
-    assert task.features[0] == Feature("obs_0", group="obs")
-    assert task.action_low == (-1.0, 0.0, -2.0)
-    assert task.action_high == (1.0, 10.0, 0.5)
-    assert (task.timestep, task.solved_return, task.terminates) == (0.05, -3.0, True)
-    assert (task.slug, task.return_floor) == ("Sledges-Sledge-v0", None)
-    assert describe("Sledges/Endless-v0", max_episode_steps=30).max_episode_steps == 30
 
 
 def test_a_dictionary_s_keys_name_the_features_in_the_order_of_flattening():
@@ -96,17 +84,12 @@ def test_a_dictionary_s_keys_name_the_features_in_the_order_of_flattening():
         *("odd_key_0", "odd_key_1", "signs.part0_0", "signs.part0_1"),
         *("signs.part1_0", "signs.part1_1", "signs.part1_2", "sledge.place", "sledge.speed"),
     )
-    assert list(task.groups) == [
-        *("odd_key", "signs.part0", "signs.part1", "sledge.place", "sledge.speed")
-    ]
     lanes = Lanes(task, 1)
     lanes.reset([0], [4])
     environment = gymnasium.make(task.id)
     observation, _ = environment.reset(seed=4)
     flat = gymnasium.spaces.flatten(environment.observation_space, observation)
     np.testing.assert_array_equal(lanes.observation[0], flat)
-    assert lanes.observation[0, 7] == observation["sledge"]["place"]
-    np.testing.assert_array_equal(lanes.observation[0, 4:7], [1, 0, 0])
 
 
 def test_an_environment_may_describe_itself():
@@ -122,13 +105,6 @@ def test_an_environment_that_is_not_reproducible_is_called_so(name):
     """One that draws on its own, and one whose used instance differs from a fresh one."""
     assert not describe(f"Sledges/{name}-v0").reproducible
     assert "no: with the same seed and actions" in jbrep("env", f"Sledges/{name}-v0").output
-
-
-def test_bounds_are_those_that_actions_of_32_bits_can_keep():
-    task = describe("Sledges/Exact-v0")
-    assert 0.1 < task.action_low[0] < 0.1 + 1e-8
-    assert 0.3 - 3e-8 < task.action_high[0] < 0.3
-    assert np.float32(task.action_low[0]) == task.action_low[0]
 
 
 def test_arguments_reach_the_environment():
@@ -147,16 +123,14 @@ def test_arguments_reach_the_environment():
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
-        ("CartPole-v1", {}, "has actions in Discrete.2.: only continuous ones are possible"),
+        ("CartPole-v1", {}, "Discrete"),
         ("Sledges/Free-v0", {}, "has actions without bounds"),
         ("Sledges/Filmed-v0", {}, "only features are possible"),
-        ("Sledges/Endless-v0", {}, "has no time limit: give one with --episode-steps"),
-        ("Pendulum", {}, "unknown task 'Pendulum'|Pendulum-v1"),
-        ("Pendulum-v9", {}, "Pendulum-v9"),
-        ("face_directoin", {}, "unknown task 'face_directoin': did you mean face_direction"),
-        ("environments:Sledges/Sledge-v0", {}, "names a module: importing it runs its code"),
-        ("Pendulum-v1", {"weight": 3}, "can't make Pendulum-v1 with {'weight': 3}: .*weight"),
-        ("Pendulum-v1", {"g": float("nan")}, "arguments must be plain JSON, all numbers finite"),
+        ("Sledges/Endless-v0", {}, "--episode-steps"),
+        ("face_directoin", {}, "did you mean face_direction"),
+        ("environments:Sledges/Sledge-v0", {}, "names a module"),
+        ("Pendulum-v1", {"weight": 3}, "weight"),
+        ("Pendulum-v1", {"g": float("nan")}, "finite"),
         ("face_direction", {"scaled": True}, "has no argument scaled"),
     ],
 )

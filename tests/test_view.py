@@ -64,15 +64,6 @@ def test_lanes_show_the_steps_before(task, seen):
     assert not lanes.num_active
 
 
-def test_a_lane_that_begins_anew_forgets():
-    lanes = Lanes(with_view(describe("Sledges/Sledge-v0"), history=2), 2)
-    first = lanes.reset([0, 1], [1, 2])
-    lanes.step(np.full((2, 3), 0.5))
-    again = lanes.reset([1], [2])
-    np.testing.assert_array_equal(again[1], first[1])
-    assert again[0, -1] == np.float32(0.5)
-
-
 @pytest.mark.parametrize("change", [{"history": 3}, {"domain": {"noise": 0.1}}])
 def test_a_step_that_is_lost_is_not_seen(change):
     broken = describe("Sledges/Broken-v0", {"how": "nan", "seed": 5}, 30, missing="skip", **change)
@@ -169,9 +160,7 @@ def test_commands_take_what_is_seen(tmp_path, monkeypatch):
     hide = "--hide *velocity* --history 2"
     task = f"--task {TASK} --episode-steps 20"
     short = "--steps 200 --evaluate-every 100 --evaluation-episodes 1 --final-episodes 1"
-    assert "move_in_direction.without-10.history-2" in run(f"env {TASK} {hide}")
     run(f"collect {task} --steps 200 --out whole")
-    assert "--hide, --history or --reward" in mistake(*["data", "derive", "whole", "--out", "seen"])
     run(f"data derive whole {hide} --out seen")
     run("data verify seen --replay 2")
     run("train-encoder --kind pca --latent 4 --data seen --out codes --name code")

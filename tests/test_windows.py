@@ -51,16 +51,6 @@ def test_windows_lie_within_episodes_and_have_the_data_sets_numbers(data, horizo
         np.testing.assert_allclose(windows.rewards(numbers, horizon), mean, atol=1e-6)
 
 
-def test_a_pass_in_blocks_has_the_same_windows(data, monkeypatch):
-    monkeypatch.setattr("jbrep.methods.passes._BLOCK", 7)
-    windows = Windows(data, data.train, 6)
-    parts = [(b.later(6), b.next_actions(6), b.mean_reward(6)) for b in blocks(data, 6, 1, 1)]
-    rows, actions, rewards = map(np.concatenate, zip(*parts, strict=True))
-    np.testing.assert_allclose(rows, windows.rows(windows.numbers, 6), rtol=1e-6)
-    np.testing.assert_allclose(actions, windows.actions(windows.numbers, 6).flatten(1), atol=1e-6)
-    np.testing.assert_allclose(rewards[:, 0], windows.rewards(windows.numbers, 6), atol=1e-6)
-
-
 def test_a_horizon_that_no_episode_has_is_refused(data):
     for look in (lambda: Windows(data, data.train, 40), lambda: next(blocks(data, 40, 1, 1))):
         with pytest.raises(

@@ -7,15 +7,10 @@ import numpy as np
 import pytest
 
 from jbrep.encoders import find, save
-from jbrep.encoders.vec_env import agent_spaces
-from jbrep.records import container
 from jbrep.records.tables import write_rows
 from jbrep.reporting.figures.panels import PAPER
 from jbrep.reporting.findings import Findings, RunFound, groups_of
-from jbrep.rl.agent import Spaces, make_agent, parameters
-from jbrep.rl.checkpoint import Header
 from jbrep.rl.files import (
-    CHECKPOINT,
     ENCODER,
     EVALUATIONS,
     FAILED,
@@ -24,7 +19,6 @@ from jbrep.rl.files import (
     Evaluation,
     RunRecord,
 )
-from jbrep.rl.overrides import check_shape
 from jbrep.rl.training import packages
 from jbrep.stats.analysis import to_plain
 from jbrep.studies.config import as_study
@@ -139,21 +133,3 @@ def write_record(folder, run, reason=None, **changes):
         policy_sha256="0" * 64 if reason is None else None,
         **{**facts, **changes},
     ).write(folder / RUN)
-
-
-def write_checkpoint(folder, run, step):
-    """A run under way at that step, with the policy that it began with; returns its agent."""
-    encoder = find(run.encoder, run.task)
-    shape = check_shape(run.learner.algorithm, run.learner.hyperparameters)
-    spaces = Spaces(*agent_spaces(run.task, encoder))
-    agent = make_agent(run.learner.algorithm, shape, spaces, run.seed)
-    tensors = {f"parameters.{name}": each.numpy() for name, each in parameters(agent)}
-    header = Header(
-        settings=run.settings(encoder),
-        versions=packages(),
-        step=step,
-        **{"episodes": [], "evaluations": [], "infos": [], "seconds": 1.0, "counters": {}},
-    )
-    container.write(folder / CHECKPOINT, tensors, header.as_json())
-    save(encoder, folder / ENCODER)
-    return agent
