@@ -5,6 +5,7 @@ import hashlib
 import json
 import operator
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -207,5 +208,6 @@ def test_tensorboard_keeps_what_was_logged_at_the_step_of_a_checkpoint(tmp_path)
         scalars.write({"evaluation": 1.0}, {"evaluation": ()}, step + 20)
         scalars.write({"evaluation": 2.0}, {"evaluation": ()}, step + 30)
         scalars.close()
+        time.sleep(1.1)  # files are read in the order of their names, which have the second in them
     events = EventAccumulator(str(tmp_path)).Reload()
     assert [e.step for e in events.Scalars("evaluation")] == [20, 40, 50]

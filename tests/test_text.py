@@ -1,4 +1,4 @@
-"""Tables and facts that fit a terminal; progress on a terminal and in a log."""
+"""Tables that fit a terminal; names as words."""
 
 from jbrep.text import slug, table, words
 
