@@ -311,6 +311,10 @@ def train(
     from jbrep.envs.make import is_one_robot
     from jbrep.rl.presets import MODERN
 
+    for name in settings.keys() - TrainingSettings.__struct_fields__:
+        raise InputError(
+            f"train has no {name!r}: give a setting of {algorithm} as overrides={{{name!r}: ...}}"
+        )
     known = check_learner(task, algorithm, preset, encoder, begin_from)
     from jbrep.machine import cores
     from jbrep.rl.history import Bar

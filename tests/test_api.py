@@ -19,7 +19,7 @@ QUICK = {"steps": 64, "evaluate_every": 64, "evaluation_episodes": 1, "final_epi
 def home(tmp_path_factory):
     """A folder with data and two encoders of them."""
     folder = tmp_path_factory.mktemp("home")
-    task = jbrep.describe("face_direction", max_episode_steps=40)
+    task = jbrep.describe("face_direction", episode_steps=40)
     data = jbrep.collect(task, folder / "data", 400, seed=3)
     assert len(data) == 400
     jbrep.train_encoder(data, folder / "encoders", "pca", latent=4)

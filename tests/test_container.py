@@ -42,7 +42,7 @@ def stopped(tmp_path_factory):
     """A run that has written a checkpoint, and the folder that has it."""
     folder = tmp_path_factory.mktemp("stopped") / "run"
     run = Run.of(
-        task=describe("face_direction", max_episode_steps=50),
+        task=describe("face_direction", episode_steps=50),
         algorithm="a2c",
         steps=40,
         preset="paper",

@@ -21,7 +21,7 @@ from jbrep.rl.policy import build
 from jbrep.rl.policy_file import find_shipped
 from jbrep.rl.presets import ALGORITHMS
 
-TASK = describe("move_to_pose", max_episode_steps=200)
+TASK = describe("move_to_pose", episode_steps=200)
 SETTINGS = {
     **{name: {"net_arch": [24, 16]} for name in ALGORITHMS},
     "td3": {"net_arch": [24], "activation_fn": "leaky_relu", "action_repeat": 3},
@@ -101,7 +101,7 @@ def test_several_robots_at_once_are_like_one_after_the_other():
 
 def test_units_of_the_actuators_are_those_of_the_task():
     """Pendulum's torque is from -2 to 2 N m."""
-    task = describe("Pendulum-v1", max_episode_steps=50)
+    task = describe("Pendulum-v1", episode_steps=50)
     trained = randomised("sac", "full", task)
     worst, spread = difference_over_an_episode(trained, controller_of(trained), 50)
     assert worst < 4e-6
@@ -116,7 +116,7 @@ def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
         def forward(self, rows):
             return torch.cat([rows, rows.sin()], -1)  # no chain of layers
 
-    task, encoder = describe("Pendulum-v1", max_episode_steps=20), Doubled()
+    task, encoder = describe("Pendulum-v1", episode_steps=20), Doubled()
     quick = {"steps": 64, "evaluation_episodes": 1, "final_episodes": 1}
     agent = jbrep.train(task, tmp_path / "own", algorithm="a2c", encoder=encoder, **quick)
     assert load_policy(tmp_path / "own", encoder)(SEEN) == agent.policy(SEEN)
@@ -132,7 +132,7 @@ def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
 @pytest.mark.parametrize("history", [1, 2])
 def test_what_is_refused_changes_nothing(history):
     """A policy that sees less takes no more; steps that hold an action are checked, too."""
-    seen = describe("Pendulum-v1", hidden=["obs_0"], history=history)
+    seen = describe("Pendulum-v1", hide=["obs_0"], history=history)
     run = Run.of(seen, "sac", preset="paper", overrides={"action_repeat": 2})
     encoder = run.find_encoder()
     trained = build(run.settings(encoder), encoder, Path("here"))
@@ -142,7 +142,7 @@ def test_what_is_refused_changes_nothing(history):
         ([0.3], takes),
         ([0.3] * (2 * history + 2), takes),  # of which it would take the first two
         (0.3, takes),
-        ([0.1, np.nan], "obs_2 is not finite: the policy takes finite numbers"),
+        ([0.1, np.nan], "no finite obs_2 for more than 0 steps in a row"),
     ]
     several = ([[0.1, 0.2]] * 3, "of shape (3, 2) after others of (2,): give the same robots, or")
     for step in range(4):
@@ -177,3 +177,41 @@ def test_what_it_cannot_act_on_is_refused():
     ):
         controller(np.full(TASK.size, 1e38))
     assert controller(np.zeros(TASK.size)).shape == (TASK.action_size,)  # there is none to hold
+
+
+@pytest.mark.parametrize("hold", [0, 2])
+def test_steps_that_are_late_or_miss_readings_have_those_before(hold):
+    """As if the last reading had come again; longer, or before any, it is refused."""
+    seen = describe("Pendulum-v1", history=3)
+    run = Run.of(seen, "sac", preset="paper", overrides={"action_repeat": 2})
+    encoder = run.find_encoder()
+    trained = build(run.settings(encoder), encoder, Path("here"))
+    late, whole = controller_of(trained), controller_of(trained)
+    late.hold = whole.hold = hold
+    rows = np.random.default_rng(1).normal(size=(9, 3)).astype(np.float32)
+    for controller in (late, whole):
+        with pytest.raises(InputError, match="no finite"):
+            controller([0.1, np.nan, 0.2])
+        controller.reset()
+        controller(rows[0], step=40)
+        controller(rows[1], step=41)
+    if not hold:
+        for lacking, step in ((None, None), (rows[2], 43)):
+            with pytest.raises(InputError, match="no finite"):
+                late(lacking, step)
+        np.testing.assert_array_equal(late(rows[2]), whole(rows[2]))
+        return
+    whole(rows[1])
+    whole(rows[1])  # the two steps that are left out
+    np.testing.assert_array_equal(late(rows[4], step=44), whole(rows[4]))
+    filled = np.where([False, True, False], rows[4], rows[5])
+    lacking = [rows[5][0], np.nan, rows[5][2]]
+    np.testing.assert_array_equal(late(lacking, step=45), whole(filled))
+    np.testing.assert_array_equal(late(None), whole(filled))
+    with pytest.raises(InputError, match="no finite"):
+        late(None)
+    with pytest.raises(InputError, match="step 46 after step 46"):
+        late(rows[6], step=46)
+    alone = late(rows[6])
+    np.testing.assert_array_equal(alone, whole(rows[6]))
+    np.testing.assert_allclose(late(rows[7:8]), whole(rows[7])[None], atol=1e-6)

@@ -61,7 +61,7 @@ def test_what_a_file_says_of_its_policy():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    task = describe("Pendulum-v1", max_episode_steps=30)
+    task = describe("Pendulum-v1", episode_steps=30)
     quick = {"steps": 64, "evaluation_episodes": 1, "final_episodes": 1}
     train(Run.of(task, "a2c", overrides={"normalize": True}, **quick), folder / "a")
     done = jbrep("policy", "export", folder / "a", "--out", folder / "a.onnx")

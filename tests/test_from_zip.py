@@ -17,7 +17,7 @@ from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, POLICY_ZIP, last_returns, read_evaluations
 
 LIMIT = 20
-PENDULUM = describe("Pendulum-v1", max_episode_steps=LIMIT)
+PENDULUM = describe("Pendulum-v1", episode_steps=LIMIT)
 
 
 class Far(gymnasium.ObservationWrapper):

@@ -352,7 +352,7 @@ def test_an_environment_that_is_here_is_described_if_it_fits(
     task = Dataset(tmp_path / "data").task
     assert (task.id, task.max_episode_steps) == (expected, 50)
     if env_id == PENDULUM:
-        assert task == describe(PENDULUM, max_episode_steps=50)
+        assert task == describe(PENDULUM, episode_steps=50)
     else:
         assert why_no_task == f"{env_id} has other sizes"
 

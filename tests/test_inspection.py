@@ -273,7 +273,7 @@ def short(folder):
     """Recordings of episodes of at most 30 steps under uniformly random actions."""
 
     def make(name, **given):
-        task = describe(name, max_episode_steps=30)
+        task = describe(name, episode_steps=30)
         path = inspect("uniform", 0, task, out=folder / f"{task.slug}.rrd", **given)
         return find_episode("uniform", 0, task), read(path)
 
@@ -390,7 +390,7 @@ def test_bodies_that_stand_still_have_one_pose_and_bare_ones_no_shape(folder):
 
 
 def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(tmp_path):
-    task = describe("face_direction", max_episode_steps=50)
+    task = describe("face_direction", episode_steps=50)
     write_checkpoint(
         tmp_path,
         Run.of(task, "a2c", encoder="dae-4", preset="paper", **ONE_EACH),

@@ -33,7 +33,7 @@ from jbrep.rl.files import CHECKPOINT, ENCODER, RUN
 from jbrep.rl.policy import load_run
 
 FACE = "Jitterbug/FaceDirection-v0"
-TASK = describe("Pendulum-v1", max_episode_steps=20)
+TASK = describe("Pendulum-v1", episode_steps=20)
 ROWS = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
 
 
@@ -252,7 +252,7 @@ def test_a_run_on_code_is_played_once_its_module_may_run(trained, monkeypatch):
     run, played = trained / "code", ("evaluate-policy", trained / "code", "--episodes", 1)
     assert not (run / ENCODER).exists()
     monkeypatch.setattr("jbrep.envs.names._imported", [])
-    assert "importing test_own runs it; if you trust it, add --import test_own" in mistake(*played)
+    assert "importing test_own runs it; if you trust it, --import test_own" in mistake(*played)
     told = mistake(*played, "--encoder", "test_own:Whole")
     assert "which has its own encoder: leave out --encoder" in told
     told = jbrep(*played, "--encoder", "test_own:Half")
@@ -291,7 +291,7 @@ def test_an_encoded_environment_shows_latents():
     env = Encoded(one(), "dae-8")
     assert isinstance(env, gymnasium.Wrapper)
     assert env.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (8,), np.float32)
-    assert env.task == describe("face_direction", max_episode_steps=10)
+    assert env.task == describe("face_direction", episode_steps=10)
     check_env(env)
     again = gymnasium.make(env.spec)
     np.testing.assert_array_equal(again.reset(seed=3)[0], env.reset(seed=3)[0])

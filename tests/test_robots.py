@@ -134,7 +134,7 @@ def test_a_run_of_another_robot_is_not_resumed(own_module, tmp_path):
     assert [*read_run(tmp_path / "run").settings.environment.files] == ["module robot42"]
     with pytest.MonkeyPatch.context() as elsewhere:
         elsewhere.delitem(gymnasium.registry, "Own/Robot-v0")
-        assert "add --import robot42" in mistake("evaluate-policy", tmp_path / "run")
+        assert "--import robot42" in mistake("evaluate-policy", tmp_path / "run")
     own_module.write_text(own_module.read_text().replace("0.5", "0.25"))
     gymnasium.registry.pop("Own/Robot-v0")
     reload(sys.modules["robot42"])

@@ -14,9 +14,9 @@ from jbrep.envs.lanes import NonFiniteActionError
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 
-FACE = describe("face_direction", max_episode_steps=100)
+FACE = describe("face_direction", episode_steps=100)
 CART = describe(cart.ID)
-MANY = (FACE, CART, describe("Pendulum-v1", max_episode_steps=30), describe("Hopper-v5"))
+MANY = (FACE, CART, describe("Pendulum-v1", episode_steps=30), describe("Hopper-v5"))
 each_task = pytest.mark.parametrize("task", MANY, ids=lambda task: task.name)
 
 
@@ -101,7 +101,7 @@ def test_lane_i_has_the_episodes_of_seed_plus_i(lanes, threads):
         return np.concatenate(rows)
 
     drive = actions(60, 1)[:, 0]
-    task = describe("move_in_direction", max_episode_steps=40)
+    task = describe("move_in_direction", episode_steps=40)
     alone = JitterbugVecEnv(task, 1, seed=10 + lanes - 1, num_threads=1)
     among = JitterbugVecEnv(task, lanes, seed=10, num_threads=threads)
     np.testing.assert_array_equal(tape(alone, 0, drive), tape(among, lanes - 1, drive))

@@ -49,9 +49,7 @@ def test_it_plays_with_other_bodies_and_time_limits():
     (usual,) = json.loads(jbrep(*played).output)["returns"]
     assert 0 <= other <= 20
     assert other != usual
-    assert (
-        find_episode(SHIPPED, 2, describe("face_direction", max_episode_steps=20)).name == SHIPPED
-    )
+    assert find_episode(SHIPPED, 2, describe("face_direction", episode_steps=20)).name == SHIPPED
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def test_a_study_from_toml(tmp_path):
         ("steps = '80'", "steps"),
         ("evaluation_episodes = 5\nfinal_episodes = 2", "final_episodes"),
         ('domain = {delay = "2..0"}', "delay"),
-        ("environment = {g = inf}", "environment"),
+        ("env = {g = inf}", "env"),
         ("data = {rows = 7}", "data.rows"),
         ('data = {folder = "it", sets = 2}', "sets"),
         ("training = {epochs = 3}", "data"),
@@ -391,7 +391,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     }
     refused = jbrep("study", path, "--out", out)
     assert "unknown task 'Robots/Pendulum-v1'" in refused.stderr
-    assert "--import PACKAGE" in refused.stderr  # its file names no module
+    assert "--import it first" in refused.stderr  # its file names no module
 
 
 @pytest.mark.parametrize(

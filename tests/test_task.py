@@ -38,7 +38,7 @@ PLAIN = Task(
 @pytest.mark.parametrize("name", TASKS)
 def test_the_jitterbug_s_tasks_are_described_without_making_them(name, monkeypatch):
     monkeypatch.setattr(gymnasium, "make", None)
-    task = describe(name, max_episode_steps=7)
+    task = describe(name, episode_steps=7)
     assert task == get_task(name).describe({}, 7)
     assert task == describe(task.id).replace(max_episode_steps=7, solved_return=0.9 * 7)
     assert (task.name, task.slug, task.timestep) == (name, name, 0.01)
@@ -87,7 +87,7 @@ def test_an_environment_of_another_package():
     assert task.action_high == (1.0, 10.0, 0.5)
     assert (task.timestep, task.solved_return, task.terminates) == (0.05, -3.0, True)
     assert (task.slug, task.return_floor) == ("Sledges-Sledge-v0", None)
-    assert describe("Sledges/Endless-v0", max_episode_steps=30).max_episode_steps == 30
+    assert describe("Sledges/Endless-v0", episode_steps=30).max_episode_steps == 30
 
 
 def test_a_dictionary_s_keys_name_the_features_in_the_order_of_flattening():
@@ -150,7 +150,7 @@ def test_arguments_reach_the_environment():
         ("CartPole-v1", {}, "has actions in Discrete.2.: only continuous ones are possible"),
         ("Sledges/Free-v0", {}, "has actions without bounds"),
         ("Sledges/Filmed-v0", {}, "only features are possible"),
-        ("Sledges/Endless-v0", {}, "has no time limit: give one with --episode-steps"),
+        ("Sledges/Endless-v0", {}, "has no time limit: give one with `episode_steps`"),
         ("Pendulum", {}, "unknown task 'Pendulum'|Pendulum-v1"),
         ("Pendulum-v9", {}, "Pendulum-v9"),
         ("face_directoin", {}, "unknown task 'face_directoin': did you mean face_direction"),
@@ -212,7 +212,7 @@ def test_a_time_limit_is_the_same_in_each_episode(sledging):
     task = sledging(lasts=[350])
     assert (task.max_episode_steps, task.timestep) == (350, 0.25)
     for other in ({"lasts": [20, 150]}, {"lasts": [350, 250]}, {"lost": 0.25}):
-        assert "--episode-steps" in refused(partial(sledging, **other))
+        assert "`episode_steps`" in refused(partial(sledging, **other))
     assert "AssertionError: the rail broke" in refused(partial(sledging, fails=300))
     assert sledging(250, fails=300).max_episode_steps == 250
     assert "failed when it was tried: AssertionError" in refused(partial(sledging, fails=30))
@@ -259,7 +259,7 @@ def test_what_was_made_for_another_task_is_refused():
         check_same(PLAIN, PLAIN.replace(id="Arms/Fetch-v0", name="Arms/Fetch-v0"), "the encoder")
     others = (Feature("x"), Feature("z"))
     with pytest.raises(
-        InputError, match=r"was made for other features of Arms/Reach-v0.*: give the same --hide"
+        InputError, match=r"was made for other features of Arms/Reach-v0.*: give the same `hide`"
     ):
         check_same(PLAIN, PLAIN.replace(features=others), "the encoder")
 

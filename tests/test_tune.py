@@ -14,7 +14,7 @@ from jbrep.rl.history import Tracker
 from jbrep.rl.learner import read_preset
 from jbrep.rl.tune import BEST, _space, tune
 
-TASK = describe("Pendulum-v1", max_episode_steps=20)
+TASK = describe("Pendulum-v1", episode_steps=20)
 RUN = Run.of(
     task=TASK,
     algorithm="a2c",

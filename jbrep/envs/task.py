@@ -273,7 +273,7 @@ class Task(Record, frozen=True):
         if self.timestep is None:
             raise InputError(
                 f"the time step of {self.name} is not known: give it as timestep in a file of "
-                "--features"
+                "`features`"
             )
         return self.timestep
 
@@ -418,11 +418,11 @@ def check_same(expected: Task, actual: Task, what: str) -> None:
         others = set(actual.feature_names) ^ set(expected.feature_names)
         such = f", such as {min(others)}" if others else ""
         raise InputError(
-            f"{what} was made for other features of {actual.name}{such}: give the same --hide, "
-            "--history and --features"
+            f"{what} was made for other features of {actual.name}{such}: give the same `hide`, "
+            "`history` and `features`"
         )
     if (actual.offsets or {}) != (expected.offsets or {}):
         raise InputError(
             f"{what} was made for features of {actual.name} with other offsets: give those in "
-            "--features"
+            "`features`"
         )

@@ -118,7 +118,7 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
 
 def _killed(name: str) -> Outcome:
     reason = f"its worker was killed {ATTEMPTS} times, perhaps because memory ran out"
-    return Outcome(name, CRASHED, f"{reason}: try fewer --workers")
+    return Outcome(name, CRASHED, f"{reason}: try fewer `workers`")
 
 
 def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
