@@ -447,15 +447,17 @@ def _note_limits(settings: "RunSettings") -> None:
         _note(
             f"{settings.learner} learns from step {settings.learns_from:,} on: "
             f"{settings.steps:,} steps leave the policy as it was drawn; take more, or another "
-            "preset"
+            "preset",
+            level=4,
         )
     if not settings.environment.reproducible:
         _note(
             f"{settings.task} is not reproducible: the same seed gives other numbers the next "
             "time, and a run that is stopped can't be resumed; the policy of its last checkpoint "
-            "can be played and exported"
+            "can be played and exported",
+            level=4,
         )
 
 
-def _note(line: str) -> None:
-    warnings.warn(line, Notice, stacklevel=3)
+def _note(line: str, level: int = 3) -> None:
+    warnings.warn(line, Notice, stacklevel=level)

@@ -7,13 +7,14 @@ import environments
 import gymnasium
 import numpy as np
 import pytest
-from command import jbrep, refused
+from command import jbrep, mistake, refused
 from gymnasium.envs.registration import EnvSpec
 
+from jbrep import api
 from jbrep.cli.generator import parse_pairs
 from jbrep.dataset.schema import episode_seed
 from jbrep.envs import Feature, Lanes, Task, describe
-from jbrep.envs.names import import_modules, imported_modules, name_given
+from jbrep.envs.names import import_modules, imported_modules, name_given, spec_of
 from jbrep.envs.recording import episode_returns
 from jbrep.envs.task import check_same
 from jbrep.errors import InputError
@@ -330,3 +331,50 @@ def test_arguments_are_shown_as_the_command_line_takes_them():
     assert shown[:3] == ["mode=fast, or not", 'number="7"', 'nothing="null"']
     assert not [each for each in shown if "\n" in each]
     assert parse_pairs(shown) == arguments
+
+
+def test_bounds_are_given_to_actions_that_have_none_and_kept_within_those_they_have():
+    free = describe("Sledges/Free-v0", action_bounds="-0.5..0.25")
+    assert (free.action_low, free.action_high) == ((-0.5,) * 3, (0.25,) * 3)
+    assert from_plain(to_plain(free), Task) == free != describe(free.id, action_bounds=(-1, 1))
+    sledge = describe(SLEDGE, action_bounds=[(-1, 0), (1, 2), (0, 0.5)])
+    assert (sledge.action_low, sledge.action_high) == ((-1, 1, 0), (0, 2, 0.5))
+    face = describe("face_direction", action_bounds=(-0.5, 0.5))  # which describes itself
+    assert (face.action_low, face.action_high) == ((-0.5,), (0.5,))
+    for wrong in ("-2..2", "0.5..-0.5", "-1..1,-1..1", "1", "a..b"):
+        assert "action_bounds" in refused(partial(describe, SLEDGE, action_bounds=wrong))
+    told = mistake("env", "Sledges/Free-v0")
+    assert "give --action-bounds, such as -1..1" in told
+    assert jbrep("env", "Sledges/Free-v0", "--action-bounds", "-1..1").exit_code == 0
+
+
+def test_a_class_or_an_instance_is_a_task(monkeypatch, tmp_path):
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    told = describe(environments.Sledge, episode_steps=30)
+    assert told.id == "environments/Sledge"
+    assert imported_modules() == ("environments",)  # for the processes that collect
+    monkeypatch.delitem(gymnasium.registry, told.id)
+    assert describe("environments/Sledge", episode_steps=30) == told
+    monkeypatch.delitem(gymnasium.registry, told.id)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    assert "environments defines it" in refused(spec_of, told)
+    assert name_given("environments:Sledge") == told.id
+
+    made = gymnasium.make("Pendulum-v1", g=3.0)
+    assert describe(made) == describe("Pendulum-v1", {"g": 3.0})
+    own = environments.Sledge(wind=0.5)
+    task = describe(own, episode_steps=30)
+    assert task.id == "instance/Sledge"
+    data = api.collect(task, tmp_path / "data", 60)
+    assert len(data) == 60
+    agent = api.train(task, tmp_path / "run", algorithm="a2c", steps=32, final_episodes=1)
+    assert agent.record.settings.one_robot
+    assert "it must be a name, a Task or an environment" in refused(describe, 7)
+
+
+def test_features_are_named_after_the_joints_that_they_are():
+    names = describe("Hopper-v5").feature_names
+    assert names[:3] == ("rootz", "rooty", "thigh_joint")
+    assert names[-1] == "foot_joint_velocity"
+    assert describe("Ant-v5").feature_names[:3] == ("root_z", "root_qw", "root_qx")
+    assert describe("Reacher-v5").feature_names[3:6] == ("obs_3", "target_x", "target_y")

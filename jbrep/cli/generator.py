@@ -312,10 +312,9 @@ def _import_option() -> click.Option:
 
 
 def _project_modules(here: Path) -> list[str]:
-    """What `import` in [tool.jbrep] of the user's own project names, to be imported from there.
+    """What `import` in [tool.jbrep] names, in the nearest pyproject.toml that has it.
 
-    That is the first pyproject.toml with such a table in the working folder, or in one above it,
-    up to that of the repository; without a repository it is the working folder's.
+    It is looked for from the working folder up to the repository's, if that is in one.
     """
     above = [here, *here.parents]
     top = next((i for i, folder in enumerate(above) if (folder / ".git").exists()), 0)

@@ -28,7 +28,7 @@ _INSTALLED = (  # packages, whose versions stand for their code
     *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")),
     Path(__file__).resolve().parents[1],
 )
-_ONE = "instance/"  # begins the ids of users' instances
+INSTANCE = "instance/"  # begins the ids of users' instances, of which there is one each
 _imported: list[str] = []
 
 
@@ -144,9 +144,8 @@ def name_given(text: str) -> str:
 def taken_for(given: Any) -> tuple[str, dict[str, Any]]:
     """The id of what is given for a task, and the arguments that it was made with.
 
-    It is a name; the class of an environment, which is registered as MODULE/CLASS; what
-    `gymnasium.make` made, if no wrapper was added; or another instance, which this process has
-    alone.
+    A class is registered as MODULE/CLASS; an instance that `gymnasium.make` didn't make, or that
+    has more wrappers, is this process's alone.
     """
     if isinstance(given, str):
         return given, {}
@@ -162,7 +161,7 @@ def taken_for(given: Any) -> tuple[str, dict[str, Any]]:
         usual = {**gymnasium.spec(made.id).kwargs, "render_mode": made.kwargs.get("render_mode")}
         differing = {n: v for n, v in made.kwargs.items() if n not in usual or usual[n] != v}
         return made.id, differing
-    name = f"{_ONE}{type(given.unwrapped).__name__}"
+    name = f"{INSTANCE}{type(given.unwrapped).__name__}"
     lent = _Lent(given)
     limit = made.max_episode_steps if made else None
     return _registered(name, lambda: lent, limit), {}
@@ -178,11 +177,6 @@ class _Lent(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def close(self) -> None:
         pass
-
-
-def is_instance(task: Task) -> bool:
-    """Whether a task's environment is a user's instance, so that there is one alone."""
-    return task.id.startswith(_ONE)
 
 
 def _register_class_of(name: str) -> None:

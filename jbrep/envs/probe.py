@@ -236,6 +236,17 @@ def _is_image(space: spaces.Space[Any]) -> bool:
 # kinds of features, by MuJoCo's model: a feature is what it equals in all states of some episodes
 
 
+_TURN_PARTS = "_qw _qx _qy _qz"
+_PARTS = {  # of the positions and velocities of joints, where these have several
+    int(mujoco.mjtJoint.mjJNT_BALL): (_TURN_PARTS, "_velocity_x _velocity_y _velocity_z"),
+    int(mujoco.mjtJoint.mjJNT_FREE): (
+        f"_x _y _z {_TURN_PARTS}",
+        "_velocity_x _velocity_y _velocity_z _angular_velocity_x _angular_velocity_y "
+        "_angular_velocity_z",
+    ),
+}
+
+
 class _Quantity(NamedTuple):
     """A number of MuJoCo's state, and what it is."""
 
@@ -271,20 +282,13 @@ def _with_kinds(env: Env, features: Sequence[Feature]) -> tuple[Feature, ...]:
 
 def _state_names(model: mujoco.MjModel) -> list[str]:
     """Names of the numbers of the state, qpos and then qvel, after their joints."""
-    positions, velocities = list[str](), list[str]()
-    for joint in range(model.njnt):
-        name, kind = model.joint(joint).name or f"joint{joint}", model.jnt_type[joint]
-        speed = f"{name}_velocity"
-        if kind == mujoco.mjtJoint.mjJNT_FREE:
-            positions += [f"{name}_{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
-            turn = f"{name}_angular_velocity"
-            velocities += [f"{each}_{axis}" for each in (speed, turn) for axis in "xyz"]
-        elif kind == mujoco.mjtJoint.mjJNT_BALL:
-            positions += [f"{name}_q{part}" for part in "wxyz"]
-            velocities += [f"{speed}_{axis}" for axis in "xyz"]
-        else:
-            positions, velocities = [*positions, name], [*velocities, speed]
-    return positions + velocities
+    joints = [model.joint(i) for i in range(model.njnt)]
+    return [
+        f"{joint.name or f'joint{joint.id}'}{part}"
+        for which in (0, 1)
+        for joint in joints
+        for part in _PARTS.get(joint.type.item(), ("", "_velocity"))[which].split(" ")
+    ]
 
 
 def _quantities(model: mujoco.MjModel) -> Iterator[tuple[int, _Quantity]]:

@@ -29,6 +29,7 @@ from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.run_settings import RunSettings
 
 SEAL, NOT_SEALED = "sha256", "0" * 64  # of an ONNX file, in whose place zeros stand then
+EXAMPLE = Path(__file__).parent / "shipped/loop.py"  # a program that runs such a file
 _HIDDEN = "latent_pi.", "mlp_extractor.policy_net.", "mu."  # sequences, numbered from 0
 _LAST = "mu", "action_net"  # single layers after them
 _RENORM_EPSILON = 1e-3  # that CrossQ's batch renormalisation adds to the variance
@@ -145,27 +146,25 @@ class Controller:
             step: the number of this control step; by default the one after the last. Those that
                 were left out are steps without an observation, in which the action was held.
         """
-        given = self._numbers(observation)
-        rows, now = np.atleast_2d(given), self._first if step is None else step
-        left_out = 0
-        if self._given is not None:
-            now = self._step + 1 if step is None else step
-            if (left_out := now - self._step - 1) < 0:
-                raise InputError(f"step {now} after step {self._step}: reset() the policy first")
+        given, begins = self._numbers(observation), self._given is None
+        rows, hold = np.atleast_2d(given), 0 if begins else self.hold
+        now = step if step is not None else 0 if begins else self._step + 1
+        first, left_out = (now, 0) if begins else (self._first, now - self._step - 1)
+        if left_out < 0:
+            raise InputError(f"step {now} after step {self._step}: reset() the policy first")
         lacking = ~np.isfinite(rows)
         missed = np.where(lacking.any(axis=1), self._missed + left_out + 1, 0)
-        if max(left_out, *missed) > self.hold:
-            name = self._names[int(np.argwhere(lacking)[0, -1])] if lacking.any() else ""
+        if max(left_out, *missed) > hold:
+            name = self._names[int(np.argwhere(lacking)[0, -1])] if lacking.any() else "observation"
             raise InputError(
-                f"no finite {name or 'observation'} for more than {self.hold} steps in a row: "
-                "the policy's `hold` says how many may pass; reset() begins anew"
+                f"no finite {name} for more than {hold} steps in a row: the policy's `hold` says "
+                "how many may pass; reset() begins anew"
             )
         if self._given is not None:
             rows = np.where(lacking, np.atleast_2d(self._given), rows)
         seen = self._with_history(rows, left_out).reshape(*given.shape[:-1], -1)
-        first = now if self._given is None else self._first
         turn = (now - first) // self.action_repeat
-        if self._given is None or turn != self._turn:
+        if begins or turn != self._turn:
             self._held = self._chosen(seen)
         self._given, self._missed = rows.reshape(given.shape), missed
         self._first, self._step, self._turn = first, now, turn

@@ -104,10 +104,7 @@ class Data(Record, frozen=True, kw_only=True):
 
 
 class Described(Record, frozen=True, kw_only=True):
-    """A task and what is said of it, as `jbrep.describe` takes it.
-
-    Features are kept as what their file holds when the study is read.
-    """
+    """A task and what is said of it, as `jbrep.describe` takes it; features as their file had."""
 
     task: str
     name: Id | None = None  # what tables call it; by default as the task
