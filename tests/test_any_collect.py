@@ -252,7 +252,7 @@ def test_reading_makes_no_environment(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.envs.description._describe", refuse)
     dataset = Dataset(folder)
     assert dataset.task == hopper
-    assert dataset["obs_10"].shape == (len(dataset),)
+    assert dataset["foot_joint_velocity"].shape == (len(dataset),)
     dataset.split()
     assert jbrep("data", "verify", folder).exit_code == 0
     assert "Hopper-v5, 11 features, 3 actions" in jbrep("data", "info", folder).output

@@ -183,7 +183,7 @@ def test_what_it_cannot_act_on_is_refused():
 def test_steps_that_are_late_or_miss_readings_have_those_before(hold):
     """As if the last reading had come again; longer, or before any, it is refused."""
     seen = describe("Pendulum-v1", history=3)
-    run = Run.of(seen, "sac", preset="paper", overrides={"action_repeat": 2})
+    run = Run.of(seen, "sac", preset="paper", overrides={"action_repeat": 4})
     encoder = run.find_encoder()
     trained = build(run.settings(encoder), encoder, Path("here"))
     late, whole = controller_of(trained), controller_of(trained)

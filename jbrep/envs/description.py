@@ -117,7 +117,7 @@ def _describe(
             raise TypeError(f"describe must return a jbrep.envs.Task with the id {spec.id}")
         if bounds:
             low, high = within(described.id, described.action_low, described.action_high, bounds)
-            described = described.replace(action_low=tuple(low), action_high=tuple(high))
+            described = described.replace(action_low=low.tolist(), action_high=high.tolist())
         return described, None
 
 
