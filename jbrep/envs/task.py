@@ -242,6 +242,11 @@ class Task(Record, frozen=True):
         if unknown := set(self.offsets or ()) - set(self.whole.feature_names):
             raise InputError(f"offsets has {min(unknown)}, which is none of its features")
 
+    def __repr__(self) -> str:
+        from jbrep.envs.description import card
+
+        return card(self)
+
     @property
     def whole(self) -> "Task":
         """The task with all that its environment gives, now."""
