@@ -340,6 +340,10 @@ def train(
     from jbrep.envs.make import is_one_robot
     from jbrep.rl.presets import MODERN
 
+    for name in settings.keys() - TrainingSettings.__struct_fields__:
+        raise InputError(
+            f"train has no {name!r}: give a setting of {algorithm} as overrides={{{name!r}: ...}}"
+        )
     known = check_learner(task, algorithm, preset, encoder, begin_from)
     from jbrep.machine import cores
     from jbrep.rl.history import Bar
@@ -466,15 +470,17 @@ def _note_limits(settings: "RunSettings") -> None:
         _note(
             f"{settings.learner} learns from step {settings.learns_from:,} on: "
             f"{settings.steps:,} steps leave the policy as it was drawn; take more, or another "
-            "preset"
+            "preset",
+            level=4,
         )
     if not settings.environment.reproducible:
         _note(
             f"{settings.task} is not reproducible: the same seed gives other numbers the next "
             "time, and a run that is stopped can't be resumed; the policy of its last checkpoint "
-            "can be played and exported"
+            "can be played and exported",
+            level=4,
         )
 
 
-def _note(line: str) -> None:
-    warnings.warn(line, Notice, stacklevel=3)
+def _note(line: str, level: int = 3) -> None:
+    warnings.warn(line, Notice, stacklevel=level)

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any, TypeVar
 
@@ -74,7 +75,9 @@ def refusing(
 def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:
     """The choice of that name."""
     if name not in choices:
-        raise InputError(f"unknown {what} {name!r}: choose one of {', '.join(choices)}")
+        near = get_close_matches(name, choices, 1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise InputError(f"unknown {what} {name!r}: {hint}choose one of {', '.join(choices)}")
     return choices[name]
 
 

@@ -119,6 +119,7 @@ def described(
     missing: Annotated[str | None, Meta(extra={"metavar": "[skip|hold:N]"})] = None,
     hide: Hide = (),
     history: History = 1,
+    action_bounds: Annotated[str | None, Meta(extra={"metavar": "LOW..HIGH"})] = None,
     step_timeout: Annotated[float, Meta(gt=0, le=1e6)] | None = None,
 ) -> "Task | None":
     """The task of that name, with what is said of its environment; None if nothing is.
@@ -129,19 +130,23 @@ def described(
         features: a TOML file with names, units, ranges, kinds and offsets of the features.
         missing: what becomes of readings that aren't finite: an episode ends before one, or the
             last one is held for at most N steps; otherwise they are errors.
+        action_bounds: of each number of an action, or of all, such as -1..1; they must be given
+            where the environment has none.
         step_timeout: seconds after which a reset or step that hasn't come back has failed, as of a
             robot that stalls.
     """
     if step_timeout:
         os.environ[STEP_TIMEOUT] = str(step_timeout)  # for processes that are started, too
     if task is None:
-        if env or episode_steps or features or missing or hide or history > 1:
-            raise InputError("give the --task: one of the Jitterbug's, or a Gymnasium id")
+        if env or episode_steps or features or missing or hide or history > 1 or action_bounds:
+            raise InputError("give the `task`: one of the Jitterbug's, or a Gymnasium id")
         return None
     from jbrep.envs.description import describe
     from jbrep.envs.names import name_given
 
-    return describe(name_given(task), env, episode_steps, features, missing, hide, history)
+    named = name_given(task)
+    said = env, episode_steps, features, missing, hide, history
+    return describe(named, *said, action_bounds=action_bounds)
 
 
 def drawn(

@@ -232,7 +232,7 @@ def test_arguments_are_settings(sledges, tmp_path):
     with pytest.raises(InputError, match=r"arguments\.wind none \(now: 0.5\)"):
         collect(some(describe(ID, {"wind": 0.5})), sledges)
     with pytest.raises(InputError, match=r"max_episode_steps 40 \(now: 9\)"):
-        collect(some(describe(ID, max_episode_steps=9)), sledges)
+        collect(some(describe(ID, episode_steps=9)), sledges)
     collect(some(describe(ID, {"wind": 0.5})), tmp_path / "windy", num_threads=1)
     assert (Dataset(tmp_path / "windy")["reward"][:10] != Dataset(sledges)["reward"][:10]).any()
 
@@ -240,7 +240,7 @@ def test_arguments_are_settings(sledges, tmp_path):
 def test_reading_makes_no_environment(tmp_path, monkeypatch):
     """None can be made, found or described then, as where its package isn't installed."""
     folder = tmp_path / "hopper"
-    hopper = describe("Hopper-v5", max_episode_steps=30)
+    hopper = describe("Hopper-v5", episode_steps=30)
     collect(some(hopper, steps=60), folder, num_threads=1)
 
     def refuse(*arguments, **keywords):
@@ -252,7 +252,7 @@ def test_reading_makes_no_environment(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.envs.description._describe", refuse)
     dataset = Dataset(folder)
     assert dataset.task == hopper
-    assert dataset["obs_10"].shape == (len(dataset),)
+    assert dataset["foot_joint_velocity"].shape == (len(dataset),)
     dataset.split()
     assert jbrep("data", "verify", folder).exit_code == 0
     assert "Hopper-v5, 11 features, 3 actions" in jbrep("data", "info", folder).output
@@ -271,7 +271,7 @@ def test_a_data_set_whose_package_isn_t_imported(sledges, tmp_path, monkeypatch)
     ):
         told = jbrep("data", *command)
         assert (told.exit_code, told.output.count("\n")) == (2, 1)
-        assert "add --import environments" in told.output
+        assert "--import environments" in told.output
     assert jbrep("data", "derive", sledges, "--history", 2, *out).exit_code == 0
     source, derived = Dataset(sledges), Dataset(tmp_path / "x")
     assert derived.manifest.versions == source.manifest.versions

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from click.testing import CliRunner
 
 import jbrep
 from jbrep.cli import main
+from jbrep.envs.names import imported_modules
 from jbrep.errors import InputError, Notice
 from jbrep.rl.policy_file import find_shipped as find
 
@@ -19,7 +21,7 @@ QUICK = {"steps": 64, "evaluate_every": 64, "evaluation_episodes": 1, "final_epi
 def home(tmp_path_factory):
     """A folder with data and two encoders of them."""
     folder = tmp_path_factory.mktemp("home")
-    task = jbrep.describe("face_direction", max_episode_steps=40)
+    task = jbrep.describe("face_direction", episode_steps=40)
     data = jbrep.collect(task, folder / "data", 400, seed=3)
     assert len(data) == 400
     jbrep.train_encoder(data, folder / "encoders", "pca", latent=4)
@@ -122,3 +124,37 @@ def test_a_command_and_its_function_write_the_same_bytes(home, tmp_path):
     CliRunner().invoke(main, arguments, catch_exceptions=False)
     (shard,) = (tmp_path / "data").glob("*.h5")
     assert shard.read_bytes() == (home / "data" / shard.name).read_bytes()
+
+
+def test_python_speaks_of_its_own_arguments_and_leaves_warnings_alone(home, tmp_path, monkeypatch):
+    before = [*warnings.filters]
+    monkeypatch.setattr("jbrep.play.sources.find_good_policy", lambda *given: None)
+    jbrep.evaluate(lambda rows: rows[:, :2], home / "data")
+    assert warnings.filters == before
+    with pytest.raises(InputError, match=r"overrides=\{'learning_rate': \.\.\.\}"):
+        jbrep.train("Pendulum-v1", tmp_path / "run", learning_rate=1e-3)
+    with pytest.raises(InputError, match="`import` it first"):
+        jbrep.describe("CartPendd-v0")
+
+
+def test_a_project_remembers_what_it_imports(tmp_path, monkeypatch):
+    deep = tmp_path / "project/deep"
+    (deep / ".git").mkdir(parents=True)
+    (tmp_path / "mybots_a.py").write_text("import environments")
+    (tmp_path / "mybots_b.py").write_text("import environments")
+    (tmp_path / "pyproject.toml").write_text("[tool.jbrep]\nimport = ['mybots_a']")
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    monkeypatch.setattr("sys.path", [*sys.path])
+
+    def imports(where):
+        monkeypatch.chdir(where)
+        CliRunner().invoke(main, ["env", "no-such-task"])
+        return imported_modules()
+
+    assert imports(deep) == ()  # a repository of its own
+    (deep / ".git").rename(tmp_path / ".git")
+    monkeypatch.setenv("JBREP_IMPORT", "mybots_b")
+    assert imports(deep) == ("mybots_a", "mybots_b")
+    (tmp_path / "pyproject.toml").write_text("[tool.jbrep]\nimport = 7")
+    told = CliRunner().invoke(main, ["env", "Pendulum-v1"])
+    assert (told.exit_code, "import in [tool.jbrep]" in told.output) == (2, True)

@@ -18,7 +18,7 @@ from jbrep.rl.normalization import Statistics
 from jbrep.rl.policy import build
 from jbrep.rl.presets import ALGORITHMS
 
-TASK = describe("move_to_pose", max_episode_steps=200)
+TASK = describe("move_to_pose", episode_steps=200)
 SETTINGS = {
     **{name: {"net_arch": [24, 16]} for name in ALGORITHMS},
     "td3": {"net_arch": [24], "activation_fn": "leaky_relu", "action_repeat": 3},
@@ -96,7 +96,7 @@ def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
         def forward(self, rows):
             return torch.cat([rows, rows.sin()], -1)  # no chain of layers
 
-    task, encoder = describe("Pendulum-v1", max_episode_steps=20), Doubled()
+    task, encoder = describe("Pendulum-v1", episode_steps=20), Doubled()
     quick = {"steps": 64, "evaluation_episodes": 1, "final_episodes": 1}
     agent = jbrep.train(task, tmp_path / "own", algorithm="a2c", encoder=encoder, **quick)
     assert load_policy(tmp_path / "own", encoder)(SEEN) == agent.policy(SEEN)
@@ -109,16 +109,16 @@ def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
 @pytest.mark.parametrize("history", [1, 2])
 def test_what_is_refused_changes_nothing(history):
     """A policy that sees less takes no more; steps that hold an action are checked, too."""
-    seen = describe("Pendulum-v1", hidden=["obs_0"], history=history)
+    seen = describe("Pendulum-v1", hide=["obs_0"], history=history)
     run = Run.of(seen, "sac", preset="paper", overrides={"action_repeat": 2})
     encoder = run.find_encoder()
     trained = build(run.settings(encoder), encoder, Path("here"))
     controller, other = controller_of(trained), controller_of(trained)
     refused = [
-        ([0.3], "takes 2 numbers"),
-        ([0.3] * (2 * history + 2), "takes 2 numbers"),  # of which it would take the first two
-        ({"obs_1": 0.1, "obs_2": 0.2}, "dict"),
-        ([0.1, np.nan], "obs_2"),
+        ([0.3], takes),
+        ([0.3] * (2 * history + 2), takes),  # of which it would take the first two
+        (0.3, takes),
+        ([0.1, np.nan], "no finite obs_2 for more than 0 steps in a row"),
     ]
     several = [[0.1, 0.2]] * 3
     for step in range(4):
@@ -135,3 +135,41 @@ def test_an_action_that_is_not_finite_is_refused():
     with np.errstate(all="ignore"), pytest.raises(InputError, match="action is not finite"):
         controller(np.full(TASK.size, 1e38))
     assert controller(np.zeros(TASK.size)).shape == (TASK.action_size,)  # there is none to hold
+
+
+@pytest.mark.parametrize("hold", [0, 2])
+def test_steps_that_are_late_or_miss_readings_have_those_before(hold):
+    """As if the last reading had come again; longer, or before any, it is refused."""
+    seen = describe("Pendulum-v1", history=3)
+    run = Run.of(seen, "sac", preset="paper", overrides={"action_repeat": 4})
+    encoder = run.find_encoder()
+    trained = build(run.settings(encoder), encoder, Path("here"))
+    late, whole = controller_of(trained), controller_of(trained)
+    late.hold = whole.hold = hold
+    rows = np.random.default_rng(1).normal(size=(9, 3)).astype(np.float32)
+    for controller in (late, whole):
+        with pytest.raises(InputError, match="no finite"):
+            controller([0.1, np.nan, 0.2])
+        controller.reset()
+        controller(rows[0], step=40)
+        controller(rows[1], step=41)
+    if not hold:
+        for lacking, step in ((None, None), (rows[2], 43)):
+            with pytest.raises(InputError, match="no finite"):
+                late(lacking, step)
+        np.testing.assert_array_equal(late(rows[2]), whole(rows[2]))
+        return
+    whole(rows[1])
+    whole(rows[1])  # the two steps that are left out
+    np.testing.assert_array_equal(late(rows[4], step=44), whole(rows[4]))
+    filled = np.where([False, True, False], rows[4], rows[5])
+    lacking = [rows[5][0], np.nan, rows[5][2]]
+    np.testing.assert_array_equal(late(lacking, step=45), whole(filled))
+    np.testing.assert_array_equal(late(None), whole(filled))
+    with pytest.raises(InputError, match="no finite"):
+        late(None)
+    with pytest.raises(InputError, match="step 46 after step 46"):
+        late(rows[6], step=46)
+    alone = late(rows[6])
+    np.testing.assert_array_equal(alone, whole(rows[6]))
+    np.testing.assert_allclose(late(rows[7:8]), whole(rows[7])[None], atol=1e-6)

@@ -157,7 +157,7 @@ def run(encoder, tmp_path_factory):
     """A short run on it."""
     folder = tmp_path_factory.mktemp("runs")
     save(encoder, folder / "it.safetensors")
-    task = describe("face_direction", max_episode_steps=20)
+    task = describe("face_direction", episode_steps=20)
     file = str(folder / "it.safetensors")
     train(Run.of(task, "a2c", encoder=file, steps=20, preset="paper", **ONE_EACH), folder / "a")
     return folder / "a"

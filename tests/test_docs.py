@@ -91,7 +91,14 @@ def test_the_features_are_those_of_the_environment_shown(tmp_path, monkeypatch):
     assert (task.reward_high, task.timestep, task.reproducible) == (0, 0.1, True)
 
 
-SHARED = (*TrainingSettings.__struct_fields__, "data", "learners", "verdicts")
+SHARED = (
+    *TrainingSettings.__struct_fields__,
+    "data",
+    "learners",
+    "verdicts",
+    "described",
+    "environment",
+)
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def test_a_robot_is_driven_as_its_run_would_drive_it(on_robot, capsys):
     counted = served(controller, made, link, 30)
     port = link.getsockname()[1]
     total = robot.play("face_direction", port, episode=0, steps=30, in_step=True)
-    task = describe("face_direction", max_episode_steps=30)
+    task = describe("face_direction", episode_steps=30)
     assert total == pytest.approx(find_player("trained", task).returns(1)[0], abs=1e-3)
     counted.result(10)
     assert f"return {total:.1f}, 0 actions late" in capsys.readouterr().out
@@ -140,7 +140,7 @@ def test_an_angle_with_and_without_its_jump(monkeypatch):
 
 def test_behaviour_of_policies_is_tabled_and_drawn(tmp_path, monkeypatch, capsys):
     """A constant drive turns the motor one way; the heuristic goes where the target points."""
-    task = describe("move_in_direction", max_episode_steps=1000)
+    task = describe("move_in_direction", episode_steps=1000)
     train(Run.of(task, "a2c", steps=80, preset="paper", **ONE_EACH), tmp_path / "run")
     policies = ["constant:drive=0.5", "heuristic", str(tmp_path / "run")]
     options = "--task", "move_in_direction", "--episodes", "2", "--target-yaw", "30"

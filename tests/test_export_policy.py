@@ -1,6 +1,7 @@
 """Policies as files for a robot: they act as the runs that they were taken from."""
 
 import json
+import runpy
 
 import numpy as np
 import onnxruntime
@@ -12,7 +13,7 @@ from test_controller import TASK, controller_of, difference_over_an_episode, ran
 from jbrep.envs.description import describe
 from jbrep.errors import InputError
 from jbrep.rl import Run, train
-from jbrep.rl.controller import described, export
+from jbrep.rl.controller import EXAMPLE, described, export
 
 KINDS = [("sac", "symmetry"), ("ppo", "coordinates"), ("td3", "dae-8"), ("crossq", "full")]
 
@@ -61,7 +62,7 @@ def test_what_a_file_says_of_its_policy():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    task = describe("Pendulum-v1", max_episode_steps=30)
+    task = describe("Pendulum-v1", episode_steps=30)
     quick = {"steps": 64, "evaluation_episodes": 1, "final_episodes": 1}
     train(Run.of(task, "a2c", overrides={"normalize": True}, **quick), folder / "a")
     done = jbrep("policy", "export", folder / "a", "--out", folder / "a.onnx")
@@ -92,3 +93,32 @@ def test_an_encoder_that_is_code_cannot_be_exported(tmp_path):
     trained = randomised("sac", lambda rows: rows[:, :2] * rows[:, 2:4])
     with pytest.raises(InputError, match="the encoder function is code, which a model can't hold"):
         export(controller_of(trained), tmp_path / "it.onnx")
+
+
+def test_the_example_loop_does_as_the_controller(tmp_path, monkeypatch):
+    """Also where steps are late, and where sensors can't be believed."""
+    task = describe("Pendulum-v1", hide=["obs_0"], history=3)
+    trained = randomised("sac", "full", task)
+    controller = controller_of(trained)
+    model, controller.hold = tmp_path / "it.onnx", 3
+    export(controller, model)
+    loop = runpy.run_path(str(EXAMPLE), {}, "loop")
+    policy = loop["Policy"](str(model))
+    rows = np.random.default_rng(0).uniform(-1, 1, (6, 2))
+    for step, row in zip((0, 1, 3, 4, 5), rows, strict=False):
+        np.testing.assert_allclose(policy(row, step), controller(row, step), atol=1e-6)
+    for lacking in ([np.nan, 0.0], None, [900.0, 0.0]):
+        step += 1
+        ours = policy(lacking, step)
+        np.testing.assert_allclose(ours, controller(None, step), atol=1e-6)
+    assert policy(None, step + 1) is None
+    with pytest.raises(ValueError, match="they must be obs_1, obs_2"):
+        policy([0.0], step + 2)
+    monkeypatch.setattr("sys.argv", ["loop.py", str(model), "4"])
+    runpy.run_path(str(EXAMPLE), {}, "__main__")
+
+
+def test_the_example_is_written_beside_the_model(run):
+    model = run.with_name("b.onnx")
+    assert "b_loop.py" in jbrep("policy", "export", run, "--out", model, "--with-example").output
+    assert model.with_name("b_loop.py").read_bytes() == EXAMPLE.read_bytes()

@@ -201,7 +201,7 @@ def short(folder):
     """Recordings of episodes of at most 30 steps under uniformly random actions."""
 
     def make(name, **given):
-        task = describe(name, max_episode_steps=30)
+        task = describe(name, episode_steps=30)
         path = inspect("uniform", 0, task, out=folder / f"{task.slug}.rrd", **given)
         return find_episode("uniform", 0, task), read(path)
 

@@ -10,7 +10,7 @@ from jbrep.envs.recording import open_loop, play, read_states, record
 from jbrep.errors import InputError
 
 TASKS = {
-    name: describe(name, max_episode_steps=30)
+    name: describe(name, episode_steps=30)
     for name in ("face_direction", "Pendulum-v1", "Hopper-v5", "Sledges/Told-v0")
 }
 SLEDGE = describe("Sledges/Sledge-v0")

@@ -159,7 +159,7 @@ def test_an_own_reward_after_the_fact(tmp_path, rewards):
 def test_rewards_for_data_that_exist_already(tmp_path, rewards):
     """Collected or imported, with rewards or without; also of what is hidden then."""
     _, log = imported(write_csv(tmp_path / "a.csv", csv_rows()), *NAMED, "--gap", "1")
-    brief = describe("face_direction", max_episode_steps=30)
+    brief = describe("face_direction", episode_steps=30)
     collect(DataSettings(task=brief, steps=90, seed=1, shard_episodes=2), tmp_path / "collected")
     code, hidden = ("--reward", "my_rewards:upright"), ("--hide", "gyro", "--history", "2")
     for source, others in ((log.folder, hidden), (tmp_path / "collected", ())):

@@ -18,7 +18,7 @@ OPEN = "uniform:0.4+ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3:0.3+constant:dr
 
 
 def mixed(task="face_direction"):
-    short = describe(task, max_episode_steps=60)
+    short = describe(task, episode_steps=60)
     policy = parse_policy(OPEN).settings()
     return settings(task=short, policy=policy, steps=600, shard_episodes=4)
 

@@ -29,7 +29,7 @@ from jbrep.rl.files import ENCODER
 from jbrep.rl.policy import load_run
 
 FACE = "Jitterbug/FaceDirection-v0"
-TASK = describe("Pendulum-v1", max_episode_steps=20)
+TASK = describe("Pendulum-v1", episode_steps=20)
 ROWS = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
 
 
@@ -239,7 +239,7 @@ def one(**options):
 def test_an_encoded_environment_shows_latents():
     env = Encoded(one(), "dae-8")
     assert env.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (8,), np.float32)
-    assert env.task == describe("face_direction", max_episode_steps=10)
+    assert env.task == describe("face_direction", episode_steps=10)
     check_env(env)
     again = gymnasium.make(env.spec)
     np.testing.assert_array_equal(again.reset(seed=3)[0], env.reset(seed=3)[0])

@@ -17,7 +17,7 @@ from jbrep.play.sources import find_policy
 from jbrep.rl.files import EVALUATION_SEED
 
 import_modules(["test_own_policies"])
-PENDULUM = describe("Pendulum-v1", max_episode_steps=20)
+PENDULUM = describe("Pendulum-v1", episode_steps=20)
 HERE = "test_own_policies"
 OPTIONS = ("--task", "Pendulum-v1", "--episode-steps", 20)
 

@@ -133,7 +133,7 @@ def test_a_history_is_of_what_was_seen():
 
 
 def test_noise_is_a_share_of_what_features_spread():
-    task = describe("Pendulum-v1", max_episode_steps=200, domain={"noise": 0.1})
+    task = describe("Pendulum-v1", episode_steps=200, domain={"noise": 0.1})
     (cosine, _, speed) = task.domain.spread
     assert 0.5 < cosine < 1
     assert 1 < speed < 8

@@ -111,7 +111,7 @@ def test_a_frame_shows_what_mujoco_renders(episode):
 @needs_egl
 @pytest.mark.parametrize("task", ["Reacher-v5", "dm_control/cheetah-run-v0"])
 def test_any_robot_of_mujoco_is_filmed(task):
-    episode = find_episode("uniform", 0, describe(task, max_episode_steps=30))
+    episode = find_episode("uniform", 0, describe(task, episode_steps=30))
     with Camera(None, *SIZE) as camera:
         film = Film([episode], camera, Pace(fps=50))
         assert film.seconds == pytest.approx(len(episode) * episode.task.timestep, abs=0.01)
@@ -131,7 +131,7 @@ def test_a_camera_that_follows_the_robot():
 
 @needs_egl
 def test_what_can_t_be_filmed(camera):
-    episode = find_episode("uniform", 0, describe("Hopper-v5", max_episode_steps=3))
+    episode = find_episode("uniform", 0, describe("Hopper-v5", episode_steps=3))
     timeless = episode.task.replace(timestep=None)
     for change in ({"note": "It differs"}, {"task": timeless}):
         with pytest.raises(InputError, match=r"It differs|time step"):

@@ -19,7 +19,7 @@ from jbrep.rl.policy import load_run
 from jbrep.rl.policy_file import read
 from jbrep.rl.presets import sb3_class
 
-TASK = describe("face_direction", max_episode_steps=50)
+TASK = describe("face_direction", episode_steps=50)
 REPEAT = 4  # of which an episode isn't a multiple
 BLOCKS = np.arange(50) // REPEAT
 

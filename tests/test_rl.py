@@ -32,7 +32,7 @@ from jbrep.rl.policy import load_run
 from jbrep.rl.presets import ALGORITHMS, get_preset, sb3_class
 
 STEPS = 100  # of an episode: little depends on its length
-TASK = describe("face_direction", max_episode_steps=STEPS)
+TASK = describe("face_direction", episode_steps=STEPS)
 QUICK = {"task": TASK, "evaluation_episodes": 1, "final_episodes": 2}
 # to evaluate the text of a run
 IMPORTS = "from msgspec import UNSET; from jbrep.envs import Feature, Task; "

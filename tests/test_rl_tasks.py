@@ -30,7 +30,7 @@ from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.presets import ALGORITHMS, get_preset
 
 CART = describe(cart.ID)
-HOPPER = describe("Hopper-v5")
+PENDULUM, HOPPER = describe("Pendulum-v1", episode_steps=50), describe("Hopper-v5")
 FAILING = CART.replace(arguments={"fail_seed": training_seed(0) + 3})
 
 

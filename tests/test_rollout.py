@@ -23,13 +23,13 @@ from jbrep.rl.policy import load_untrained
 
 
 def short(name):
-    return describe(name, max_episode_steps=30)
+    return describe(name, episode_steps=30)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
-    task = describe("face_direction", max_episode_steps=200)
+    task = describe("face_direction", episode_steps=200)
     short = {"preset": "paper", "steps": 64, "evaluation_episodes": 2, "final_episodes": 2}
     train(Run.of(task, "a2c", encoder="dae-8", **short), folder)
     return folder
@@ -90,7 +90,7 @@ def test_a_policy_before_training_is_the_one_that_was_evaluated_first(run):
 
 
 def test_a_named_policy_plays_alone_as_among_others():
-    task = describe("move_to_pose", max_episode_steps=200)
+    task = describe("move_to_pose", episode_steps=200)
     alone = find_episode("heuristic", 1, task)
     returns = episode_returns(Lanes(task, 2), HEURISTICS["move_to_pose"], EVALUATION_SEED)
     assert alone.episode_return == pytest.approx(returns[1], rel=1e-6)
@@ -98,7 +98,7 @@ def test_a_named_policy_plays_alone_as_among_others():
 
 
 def test_a_policy_plays_through_an_encoder():
-    task = describe("face_direction", max_episode_steps=20)
+    task = describe("face_direction", episode_steps=20)
     player = find_player("heuristic", task)
     decoding = [player.with_reconstruction(find(each, task)) for each in ("full", "pca-4")]
     direct, whole, blurred = (each.play([0])[0] for each in (player, *decoding))
@@ -141,5 +141,5 @@ def test_what_comes_out_differently_or_can_t_be_simulated_is_shown_as_stored(hop
 def test_a_run_is_of_its_task_and_plays_it_for_longer_or_shorter(run):
     with pytest.raises(InputError, match="is of face_direction, not of move_to_pose"):
         find_player(str(run), describe("move_to_pose"))
-    player = find_player(str(run), describe("face_direction", max_episode_steps=20))
+    player = find_player(str(run), describe("face_direction", episode_steps=20))
     assert [len(rollout) for rollout in player.play([0])] == [20]

@@ -15,7 +15,7 @@ from jbrep.rl.controller import export, load_policy
 from jbrep.rl.policy_file import find_shipped as find
 
 EPISODES, STEPS = 16, 150
-TASK = describe("face_direction", max_episode_steps=STEPS)
+TASK = describe("face_direction", episode_steps=STEPS)
 NAMED = ("--time", "time", "--episode", "trial", "--task", "face_direction")
 SEEN = "position*,orientation*,velocity*,angular*,motor*,angle*"
 

@@ -33,7 +33,7 @@ from jbrep.rl.files import (
 from jbrep.rl.history import Scalars
 from jbrep.rl.policy import load_run, load_untrained
 
-TASK = describe("face_direction", max_episode_steps=100)
+TASK = describe("face_direction", episode_steps=100)
 SETTINGS = Run.of(
     task=TASK,
     algorithm="a2c",

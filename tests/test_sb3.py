@@ -13,9 +13,9 @@ from jbrep.envs import Lanes, describe
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 
-FACE = describe("face_direction", max_episode_steps=100)
+FACE = describe("face_direction", episode_steps=100)
 CART = describe(cart.ID)
-MANY = (FACE, CART, describe("Pendulum-v1", max_episode_steps=30), describe("Hopper-v5"))
+MANY = (FACE, CART, describe("Pendulum-v1", episode_steps=30), describe("Hopper-v5"))
 each_task = pytest.mark.parametrize("task", MANY, ids=lambda task: task.name)
 
 

@@ -24,7 +24,7 @@ from jbrep.rl.presets import sb3_class
 from jbrep.studies.config import as_study, read_study
 from jbrep.studies.plan import Plan, read_plan
 
-TASK = describe("Pendulum-v1", max_episode_steps=20)
+TASK = describe("Pendulum-v1", episode_steps=20)
 PINK = {"kind": "coloured", "beta": 1, "sigma": 0.2}
 HELD = {"action_repeat": 3, "n_steps": 2}
 SMALL = {"net_arch": [8], "learning_starts": 10, "train_freq": 5, "batch_size": 8}

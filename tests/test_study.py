@@ -26,7 +26,9 @@ from command import (
 from small import adopt, forge
 
 from jbrep.encoders import load
+from jbrep.envs import describe
 from jbrep.errors import InputError
+from jbrep.records.record import from_plain, to_plain
 from jbrep.reporting.findings import Findings
 from jbrep.reporting.tables import read_tables
 from jbrep.rl.files import CHECKPOINT, RUN, read_run
@@ -128,7 +130,7 @@ def test_a_study_from_toml(tmp_path):
         ("steps = '80'", "steps"),
         ("evaluation_episodes = 5\nfinal_episodes = 2", "final_episodes"),
         ('domain = {delay = "2..0"}', "delay"),
-        ("environment = {g = inf}", "environment"),
+        ("env = {g = inf}", "env"),
         ("data = {rows = 7}", "data.rows"),
         ('data = {folder = "it", sets = 2}', "sets"),
         ("training = {epochs = 3}", "data"),
@@ -391,7 +393,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     }
     refused = jbrep("study", path, "--out", out)
     assert "unknown task 'Robots/Pendulum-v1'" in refused.stderr
-    assert "--import PACKAGE" in refused.stderr  # its file names no module
+    assert "--import it first" in refused.stderr  # its file names no module
 
 
 @pytest.mark.parametrize(
@@ -423,3 +425,33 @@ def test_what_a_run_killed_at_its_very_end_left_is_removed(done):
     left.write_bytes(b"left")
     run_study(done, on_this_machine, 1)
     assert not left.exists()
+
+
+def test_a_task_is_described_in_a_study_as_everywhere(tmp_path):
+    features = tmp_path / "features.toml"
+    features.write_text("timestep = 0.5\n" + "[[features]]\nunit = 'm'\n" * 3)
+    file = written(
+        tmp_path,
+        'tasks = ["Pendulum-v1", {task = "Pendulum-v1", name = "moon", env = {g = 1.6}, '
+        'action_bounds = "-1..1", hide = ["obs_2"], episode_steps = 9}]',
+        "history = 3",
+        f'features = "{features}"',
+    )
+    study = read_study(file)
+    plain, moon = study.task("Pendulum-v1"), study.task("moon")
+    expected = describe(
+        *("Pendulum-v1", {"g": 1.6}, 9, features),
+        hide=["obs_2"],
+        history=3,
+        action_bounds=(-1, 1),
+    )
+    assert moon == expected.replace(name="moon")
+    assert (plain.view.history, plain.timestep, plain.action_high) == (3, 0.5, (2.0,))
+    features.unlink()  # the study has what it held
+    assert as_study(tomllib.loads(study.toml())) == study
+    assert from_plain(to_plain(study), Study) == study
+    assert {cell.task for cell in Plan(study, tmp_path).cells} == {"Pendulum-v1", "moon"}
+    other = as_study(tomllib.loads(study.toml()) | {"history": 2, "tasks": ["Pendulum-v1"]})
+    Plan(study, tmp_path / "it").write()
+    with pytest.raises(InputError, match=r"tasks\.Pendulum-v1\.history 3 \(now: 2\)"):
+        Plan(other, tmp_path / "it").check_folder()

@@ -7,13 +7,14 @@ import environments
 import gymnasium
 import numpy as np
 import pytest
-from command import jbrep, refused
+from command import jbrep, mistake, refused
 from gymnasium.envs.registration import EnvSpec
 
+from jbrep import api
 from jbrep.cli.generator import parse_pairs
 from jbrep.dataset.schema import episode_seed
 from jbrep.envs import Feature, Lanes, Task, describe
-from jbrep.envs.names import import_modules, imported_modules, name_given
+from jbrep.envs.names import import_modules, imported_modules, name_given, spec_of
 from jbrep.envs.recording import episode_returns
 from jbrep.envs.task import check_same
 from jbrep.errors import InputError
@@ -38,7 +39,7 @@ PLAIN = Task(
 @pytest.mark.parametrize("name", TASKS)
 def test_the_jitterbug_s_tasks_are_described_without_making_them(name, monkeypatch):
     monkeypatch.setattr(gymnasium, "make", None)
-    task = describe(name, max_episode_steps=7)
+    task = describe(name, episode_steps=7)
     assert task == get_task(name).describe({}, 7)
     assert task == describe(task.id).replace(max_episode_steps=7, solved_return=0.9 * 7)
     assert (task.name, task.slug, task.timestep) == (name, name, 0.01)
@@ -49,7 +50,9 @@ def test_the_jitterbug_s_tasks_are_described_without_making_them(name, monkeypat
 def test_an_environment_of_gymnasium():
     hopper = describe("Hopper-v5")
     assert (hopper.name, hopper.slug, hopper.size) == ("Hopper-v5", "Hopper-v5", 11)
-    assert hopper.feature_names == tuple(f"obs_{i}" for i in range(11))
+    assert hopper.feature_names[:3] == ("rootz", "rooty", "thigh_joint")  # after its joints
+    assert hopper.feature_names[-1] == "foot_joint_velocity"
+    assert repr(hopper).startswith("Hopper-v5\n")
     assert (hopper.action_low, hopper.action_high) == ((-1.0,) * 3, (1.0,) * 3)
     assert (hopper.max_episode_steps, hopper.timestep) == (1000, 0.008)
     assert (hopper.terminates, hopper.reproducible, hopper.seed_bits) == (True, True, 63)
@@ -126,7 +129,7 @@ def test_arguments_reach_the_environment():
         ("CartPole-v1", {}, "Discrete"),
         ("Sledges/Free-v0", {}, "has actions without bounds"),
         ("Sledges/Filmed-v0", {}, "only features are possible"),
-        ("Sledges/Endless-v0", {}, "--episode-steps"),
+        ("Sledges/Endless-v0", {}, "episode_steps"),
         ("face_directoin", {}, "did you mean face_direction"),
         ("environments:Sledges/Sledge-v0", {}, "names a module"),
         ("Pendulum-v1", {"weight": 3}, "weight"),
@@ -186,7 +189,7 @@ def test_a_time_limit_is_the_same_in_each_episode(sledging):
     task = sledging(lasts=[350])
     assert (task.max_episode_steps, task.timestep) == (350, 0.25)
     for other in ({"lasts": [20, 150]}, {"lasts": [350, 250]}, {"lost": 0.25}):
-        assert "--episode-steps" in refused(partial(sledging, **other))
+        assert "`episode_steps`" in refused(partial(sledging, **other))
     assert "AssertionError: the rail broke" in refused(partial(sledging, fails=300))
     assert sledging(250, fails=300).max_episode_steps == 250
     assert "failed when it was tried: AssertionError" in refused(partial(sledging, fails=30))
@@ -233,7 +236,7 @@ def test_what_was_made_for_another_task_is_refused():
         check_same(PLAIN, PLAIN.replace(id="Arms/Fetch-v0", name="Arms/Fetch-v0"), "the encoder")
     others = (Feature("x"), Feature("z"))
     with pytest.raises(
-        InputError, match=r"was made for other features of Arms/Reach-v0.*: give the same --hide"
+        InputError, match=r"was made for other features of Arms/Reach-v0.*: give the same `hide`"
     ):
         check_same(PLAIN, PLAIN.replace(features=others), "the encoder")
 
@@ -304,3 +307,47 @@ def test_arguments_are_shown_as_the_command_line_takes_them():
     assert shown[:3] == ["mode=fast, or not", 'number="7"', 'nothing="null"']
     assert not [each for each in shown if "\n" in each]
     assert parse_pairs(shown) == arguments
+
+
+def test_bounds_are_given_to_actions_that_have_none_and_kept_within_those_they_have():
+    free = describe("Sledges/Free-v0", action_bounds="-0.5..0.25")
+    assert (free.action_low, free.action_high) == ((-0.5,) * 3, (0.25,) * 3)
+    assert from_plain(to_plain(free), Task) == free != describe(free.id, action_bounds=(-1, 1))
+    sledge = describe(SLEDGE, action_bounds=[(-1, 0), (1, 2), (0, 0.5)])
+    assert (sledge.action_low, sledge.action_high) == ((-1, 1, 0), (0, 2, 0.5))
+    face = describe("face_direction", action_bounds=(-0.5, 0.5))  # which describes itself
+    assert (face.action_low, face.action_high) == ((-0.5,), (0.5,))
+    for wrong in ("-2..2", "0.5..-0.5", "-1..1,-1..1", "1", "a..b"):
+        assert "action_bounds" in refused(partial(describe, SLEDGE, action_bounds=wrong))
+    told = mistake("env", "Sledges/Free-v0")
+    assert "give --action-bounds, such as -1..1" in told
+    assert jbrep("env", "Sledges/Free-v0", "--action-bounds", "-1..1").exit_code == 0
+
+
+def test_a_class_or_an_instance_is_a_task(monkeypatch, tmp_path):
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    told = describe(environments.Sledge, episode_steps=30)
+    assert told.id == "environments/Sledge"
+    assert imported_modules() == ("environments",)  # for the processes that collect
+    monkeypatch.delitem(gymnasium.registry, told.id)
+    assert describe("environments/Sledge", episode_steps=30) == told
+    monkeypatch.delitem(gymnasium.registry, told.id)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    assert "environments defines it" in refused(spec_of, told)
+    assert name_given("environments:Sledge") == told.id
+
+    made = gymnasium.make("Pendulum-v1", g=3.0)
+    assert describe(made) == describe("Pendulum-v1", {"g": 3.0})
+    own = environments.Sledge(wind=0.5)
+    task = describe(own, episode_steps=30)
+    assert task.id == "instance/Sledge"
+    data = api.collect(task, tmp_path / "data", 60)
+    assert len(data) >= 60
+    agent = api.train(task, tmp_path / "run", algorithm="a2c", steps=32, final_episodes=1)
+    assert agent.record.settings.one_robot
+    assert "it must be a name, a Task or an environment" in refused(describe, 7)
+
+
+def test_features_are_named_after_the_joints_that_they_are():
+    assert describe("Ant-v5").feature_names[:3] == ("root_z", "root_qw", "root_qx")
+    assert describe("Reacher-v5").feature_names[3:6] == ("obs_3", "target_x", "target_y")

@@ -27,7 +27,7 @@ from jbrep.rl.files import CHECKPOINT
 from jbrep.rl.policy import load_run, pack
 
 import_modules(["environments"])
-SHORT = describe("face_direction", max_episode_steps=40)
+SHORT = describe("face_direction", episode_steps=40)
 SLEDGE = describe("Sledges/Sledge-v0")
 POLICY = "policy-0.safetensors"
 NORMALIZE = {"normalize": True}

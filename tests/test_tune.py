@@ -5,7 +5,7 @@ from argparse import Namespace
 
 import jbrep
 
-TASK = jbrep.describe("Pendulum-v1", max_episode_steps=20)
+TASK = jbrep.describe("Pendulum-v1", episode_steps=20)
 
 
 def test_a_search_goes_on_from_its_trials(tmp_path, capsys):

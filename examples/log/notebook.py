@@ -22,7 +22,7 @@ from jbrep.rl.policy_file import find_shipped as find
 EPISODES, LIMIT, STEPS = 40, 1000, 150_000
 OUT = Path("from-a-log")
 OUT.mkdir()
-task = jbrep.describe("face_direction", max_episode_steps=LIMIT)
+task = jbrep.describe("face_direction", episode_steps=LIMIT)
 
 # %% [markdown]
 # ## A log

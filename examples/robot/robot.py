@@ -22,7 +22,7 @@ _PATIENCE = 5.0  # seconds to wait for an answer, in step
 
 def play(task: str, port: int, episode: int, steps: int | None, in_step: bool) -> float:
     """Play an episode of evaluation; its return."""
-    described = jbrep.describe(task, max_episode_steps=steps)
+    described = jbrep.describe(task, episode_steps=steps)
     lanes, total, late = jbrep.Lanes(described, 1), 0.0, 0
     observation = lanes.reset([0], [EVALUATION_SEED + episode])[0]
     action = np.zeros(described.action_size, np.float32)

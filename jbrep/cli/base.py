@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 
 import click
 
-from jbrep.cli.generator import Command
+from jbrep.cli.generator import Command, with_its_options
 from jbrep.cli.signals import leave
 from jbrep.errors import InputError, Notice
 from jbrep.text import printable, terminal_width, wrapped
@@ -46,7 +46,8 @@ def _notices() -> Iterator[None]:
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if issubclass(category, Notice):
-            line = f"Note: {message}"
+            told = with_its_options(str(message), click.get_current_context(silent=True))
+            line = f"Note: {told}"
             (say if os.sep in line else tell)(line, err=True)  # a path may be copied
         else:
             usual(message, category, *where, **options)

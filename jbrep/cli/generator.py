@@ -11,6 +11,7 @@ or the fields of a record, too.
 import inspect
 import json
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from functools import partial
 from pathlib import Path
@@ -21,8 +22,9 @@ import click
 from msgspec import NODEFAULT, Meta
 
 from jbrep.errors import InputError
+from jbrep.records.document import read_toml
 from jbrep.records.keys import Key, keys_of, option_name
-from jbrep.records.record import from_text
+from jbrep.records.record import converted, from_text
 
 _Parameter = inspect.Parameter
 _SECTIONS = re.compile(r"\n+(Args|Returns|Raises):\n.*", re.DOTALL)
@@ -240,6 +242,14 @@ class Command(click.Command):
             self.params = [*self.options(), _import_option()]
         return super().get_params(ctx)
 
+    def invoke(self, ctx: click.Context) -> Any:
+        """Call the function; messages speak of the options that this command has."""
+        try:
+            return super().invoke(ctx)
+        except InputError as error:
+            error.args = (with_its_options(str(error), ctx),)
+            raise
+
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Let options that may be repeated take several values at once: --latent 12 8 4.
 
@@ -267,6 +277,12 @@ def _with_options(text: str, options: Mapping[str, str]) -> str:
     return re.sub(r"`(\w+)`", lambda found: options.get(found[1], found[0]), text)
 
 
+def with_its_options(text: str, ctx: click.Context | None) -> str:
+    """A message of a function, which speaks of `parameters`, as one of the command."""
+    options = ctx.command.get_params(ctx) if ctx else []
+    return _with_options(text, {each.name: each.opts[0] for each in options if each.name})
+
+
 def _import_code(names: Iterable[str]) -> None:
     """Import the modules of names such as mymodule:MyEncoder."""
     if named := [name for name in names if ":" in name]:
@@ -278,7 +294,7 @@ def _import_code(names: Iterable[str]) -> None:
 
 def _import_option() -> click.Option:
     def load(context: click.Context, option: click.Parameter, modules: tuple[str, ...]) -> None:
-        if modules:
+        if modules := (*_project_modules(Path.cwd()), *modules):
             from jbrep.envs.names import import_modules
 
             import_modules(modules)
@@ -287,11 +303,28 @@ def _import_option() -> click.Option:
         ["--import"],
         multiple=True,
         metavar="MODULE",
+        envvar="JBREP_IMPORT",
         expose_value=False,
         is_eager=True,  # it takes effect before the command begins
         callback=load,
         help="Import a module that registers environments; this runs its code.",
     )
+
+
+def _project_modules(here: Path) -> list[str]:
+    """What `import` in [tool.jbrep] names, in the nearest pyproject.toml that has it.
+
+    It is looked for from the working folder up to the repository's, if that is in one.
+    """
+    above = [here, *here.parents]
+    top = next((i for i, folder in enumerate(above) if (folder / ".git").exists()), 0)
+    for folder in above[: top + 1]:
+        if (file := folder / "pyproject.toml").is_file():
+            own = read_toml(file).get("tool", {}).get("jbrep", {})
+            if modules := own.get("import"):
+                sys.path.append(str(folder))
+                return converted(modules, list[str], f"import in [tool.jbrep] of {file}")
+    return []
 
 
 def parse_pairs(given: Iterable[str], option: str = "--env") -> dict[str, Any]:

@@ -59,6 +59,7 @@ def export(
     *,
     task: TaskName = None,
     form: Annotated[str, Meta(extra={"option": "format"})] = "onnx",
+    with_example: bool = False,
 ) -> None:
     """Write a policy as one model, from raw observations to actions.
 
@@ -69,11 +70,13 @@ def export(
 
     Args:
         form: either onnx, or torch for a program of torch.export.
+        with_example: write a control loop beside it, which checks sensors and needs no jbrep.
     """
     from jbrep.envs.description import describe
     from jbrep.envs.names import modules_of
     from jbrep.play.sources import policy_file
-    from jbrep.rl.controller import described, load_policy
+    from jbrep.records.storage import write_new
+    from jbrep.rl.controller import EXAMPLE, described, load_policy
     from jbrep.rl.controller import export as write
     from jbrep.rl.policy_file import SHIPPED
 
@@ -83,10 +86,15 @@ def export(
             "folder or a policy's file, which say their own: leave out --task"
         )
     controller = load_policy(policy_file(policy, describe(task) if task else None))
+    loop = out.with_name(f"{out.stem}_loop.py")
+    if with_example:
+        write_new(loop, EXAMPLE.read_bytes())
     write(controller, out, form)
     said, own = described(controller), controller.task
     rate = "" if said["rate"] is None else f", {said['rate']:g} times a second"
     say(f"{out}: {own.size} numbers of {own.name} to {own.action_size}{rate}")
+    if with_example:
+        say(f"run it with python {loop} {out}")
     if form == "onnx":
         modules = [f"--import={module}" for module in modules_of(own)]
         check = ["jbrep", "evaluate-policy", str(out), "--beside", policy, *modules]

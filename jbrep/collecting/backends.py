@@ -87,7 +87,7 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
                 if result is None:
                     raise InputError(
                         f"the worker that began with episode {piece.start} was killed "
-                        f"{ATTEMPTS} times, perhaps because memory ran out: try fewer --threads"
+                        f"{ATTEMPTS} times, perhaps because memory ran out: try fewer `threads`"
                     )
                 made[piece] = result
                 while ahead.waiting and ahead.waiting[0] in made:

@@ -50,7 +50,7 @@ def make_coordinates(
     if made.names == task.feature_names:
         raise InputError(
             f"{task.name} has no features of which {system} would be anything else than the "
-            "observation: say of what kinds they are, with --features FILE.toml"
+            "observation: say of what kinds they are, with `features` FILE.toml"
         )
     return made
 

@@ -146,10 +146,10 @@ def find_alone(name: Any, task: Task | None) -> BaseEncoder:
         return name
     if is_code(name) or not isinstance(name, (str, Path)):
         raise InputError(
-            f"{name} isn't a file, which would say what it observes: give its --task, too"
+            f"{name} isn't a file, which would say what it observes: give its `task`, too"
         )
     if not exists(name):
-        raise InputError(f"no encoder at {name}: for one that ships, give its --task, too")
+        raise InputError(f"no encoder at {name}: for one that ships, give its `task`, too")
     return load(Path(name))
 
 

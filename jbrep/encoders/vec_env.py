@@ -72,7 +72,7 @@ class JitterbugVecEnv(VecEnv):
         retries: int = 0,
     ):
         if isinstance(task, str):
-            task = describe(task, max_episode_steps=max_episode_steps)
+            task = describe(task, episode_steps=max_episode_steps)
         elif max_episode_steps not in (None, task.max_episode_steps):
             raise InputError(f"{task.name} is described with its time limit: describe it anew")
         self.task = task

@@ -14,9 +14,9 @@ from jbrep.envs.aside import aside
 from jbrep.envs.domain import PHYSICS, SIGNALS, Domain, read_ranges
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import creator, give_back, is_batched, take
-from jbrep.envs.names import absolute, code_of, files_of, find_spec, spec_of
+from jbrep.envs.names import absolute, code_of, files_of, find_spec, spec_of, taken_for
 from jbrep.envs.physics import can_be_pushed, physics_of
-from jbrep.envs.probe import Signals, precision_problems, probe
+from jbrep.envs.probe import Bounds, Signals, precision_problems, probe, within
 from jbrep.envs.task import EpisodeSteps, Feature, Frame, Kind, Task, Word
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError, Notice, refusing
@@ -29,14 +29,15 @@ _MOST_FEATURES = 60  # shown on a card
 
 
 def describe(
-    name: str,
-    arguments: Mapping[str, Any] | None = None,
-    max_episode_steps: int | None = None,
-    features: Path | None = None,
+    name: Any,
+    env: Mapping[str, Any] | None = None,
+    episode_steps: int | None = None,
+    features: Path | str | Mapping[str, Any] | None = None,
     missing: str | None = None,
-    hidden: Iterable[str] = (),
+    hide: Iterable[str] = (),
     history: int = 1,
     domain: Mapping[str, Any] | None = None,
+    action_bounds: Bounds | str | None = None,
 ) -> Task:
     """Describe a task: its environment is made and played for some steps.
 
@@ -44,50 +45,61 @@ def describe(
     and the time limit or None, returns the `Task`; nothing is played then.
 
     Args:
-        name: one of the Jitterbug's tasks, or an id in Gymnasium's registry.
-        arguments: of the environment, plain JSON; files that they name become absolute paths.
-        max_episode_steps: the time limit [steps]; the registered one if not given.
+        name: one of the Jitterbug's tasks, an id in Gymnasium's registry, or an environment: its
+            class, or an instance, which exists in this process alone.
+        env: arguments of the environment, plain JSON; files that they name become absolute paths.
+        episode_steps: the time limit; the registered one if not given.
         features: a TOML file with names, units, ranges, kinds and offsets, see
-            docs/environments.md.
+            docs/environments.md, or what it would hold.
         missing: what becomes of readings that aren't finite, see `Task`; by default an error.
-        hidden: what isn't seen of it, see `jbrep.envs.view.with_view`.
+        hide: what isn't seen of it, see `jbrep.envs.view.with_view`.
         history: states that are seen at once, see there.
         domain: numbers and ranges from which each episode draws, such as {"delay": "0..2"}, see
             `jbrep.envs.domain.Domain`.
+        action_bounds: of all numbers of an action, (-1, 1) or "-1..1", or of each: "-1..1,0..5".
+            Within the environment's own; they must be given where that has none.
     """
-    spec, given = find_spec(name), absolute(arguments or {})
+    name, made_with = taken_for(name)
+    spec, given = find_spec(name), absolute({**made_with, **(env or {})})
     if "max_episode_steps" in given:
         raise InputError(
-            f"max_episode_steps is no argument of {spec.id}: --episode-steps sets the time limit"
+            f"max_episode_steps is no argument of {spec.id}: `episode_steps` sets the time limit"
         )
+    bounds = read_bounds(action_bounds)
     every = {**spec.kwargs, **given}
     files = files_of(every)
     registered = spec.max_episode_steps, spec.reward_threshold, repr(spec.kwargs)
     key = (spec.entry_point, registered, tuple(files.items()))
-    task, signals = _describe(name, json.dumps(given, sort_keys=True), max_episode_steps, key)
+    task, signals = _describe(name, json.dumps(given, sort_keys=True), episode_steps, bounds, key)
     now = files_of(every)  # the environment may write one of them, such as a log
     kept = {file: digest for file, digest in files.items() if now.get(file) == digest}
     if own := kept | code_of(creator(spec)):
         task = task.replace(files=own)
-    task = with_features(task, features) if features else task
+    task = with_features(task, features) if features is not None else task
     for problem in precision_problems(task, signals):
         warnings.warn(problem, Notice, stacklevel=2)
     task = task.replace(missing=missing) if missing else task
-    return with_domain(with_view(task, hidden, history), domain or {})
+    return with_domain(with_view(task, hide, history), domain or {})
 
 
-def as_task(given: Task | str) -> Task:
-    """A task, or the one of that name, described."""
-    if isinstance(given, Task):
-        return given
-    if not isinstance(given, str):
-        raise InputError(f"the task is {given!r}: it must be a name or a Task")
-    return describe(given)
+def as_task(given: Any) -> Task:
+    """A task, or what `describe` takes for one, described."""
+    return given if isinstance(given, Task) else describe(given)
+
+
+def read_bounds(given: Bounds | str | None) -> Bounds:
+    """Bounds of actions as people write them: "-1..1", or "-1..1,0..5", one for each number."""
+    parts: Any = given or ()
+    if isinstance(parts, str):
+        parts = [each.split("..") for each in parts.split(",")]
+    elif parts and np.ndim(parts) == 1:
+        parts = [parts]
+    return converted(parts, Bounds, "action_bounds", strict=False)
 
 
 @lru_cache(maxsize=64)
 def _describe(
-    name: str, arguments: str, max_episode_steps: int | None, key: tuple[Any, ...]
+    name: str, arguments: str, max_episode_steps: int | None, bounds: Bounds, key: tuple[Any, ...]
 ) -> tuple[Task, Signals | None]:
     """The task, and what its features went through where it was played.
 
@@ -99,10 +111,13 @@ def _describe(
     with refusing(f"{spec.id} failed when it was tried"), aside():
         own = getattr(creator(spec), "describe", None)
         if own is None:
-            return probe(spec.id, given, max_episode_steps)
+            return probe(spec.id, given, max_episode_steps, bounds)
         described = own({**spec.kwargs, **given}, max_episode_steps)
         if not (isinstance(described, Task) and described.id == spec.id):
             raise TypeError(f"describe must return a jbrep.envs.Task with the id {spec.id}")
+        if bounds:
+            low, high = within(described.id, described.action_low, described.action_high, bounds)
+            described = described.replace(action_low=low.tolist(), action_high=high.tolist())
         return described, None
 
 
@@ -133,9 +148,9 @@ class _TaskChanges(Record, frozen=True):
     features: tuple[_FeatureChanges, ...] | None = None
 
 
-def with_features(task: Task, path: Path) -> Task:
-    """The task with what a TOML file says of its features and rewards."""
-    given = read_toml(path)
+def with_features(task: Task, said: Path | str | Mapping[str, Any]) -> Task:
+    """The task with what a TOML file, or a table, says of its features and rewards."""
+    given = said if isinstance(said, Mapping) else read_toml(Path(said))
     try:
         changes = from_plain(given, _TaskChanges)
         rows = changes.features
@@ -143,17 +158,18 @@ def with_features(task: Task, path: Path) -> Task:
             raise InputError(f"it must have a [[features]] for each of the {task.size} features")
         features, offsets = list(task.features), {}
         for i, row in enumerate(rows or ()):
-            said = _said(row)
-            offset = said.pop("offset", 0.0)
+            own = _said(row)
+            offset = own.pop("offset", 0.0)
             ends = {name: getattr(features[i], name) for name in ("low", "high")}
             left = {name: end - offset for name, end in ends.items() if end is not None}
-            features[i] = features[i].replace(**left | said)
+            features[i] = features[i].replace(**left | own)
             if offset:
                 offsets[features[i].name] = offset
         told = {**_said(changes), "features": features}
         return task.replace(**told, **({"offsets": offsets} if offsets else {}))
     except InputError as error:
-        raise InputError(f"{path} can't be used for {task.name}: {error}") from None
+        where = "features" if isinstance(said, Mapping) else said
+        raise InputError(f"{where} can't be used for {task.name}: {error}") from None
 
 
 def _said(changes: Record) -> dict[str, Any]:

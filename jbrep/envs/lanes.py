@@ -404,7 +404,7 @@ class Separate:
         if not after_step or self._held[lane] > most_held(self._task.missing or ""):
             raise EnvironmentFailedError(
                 f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
-                f"reward that is not finite in 32 bits, {self._where(lane)}: --missing says what "
+                f"reward that is not finite in 32 bits, {self._where(lane)}: `missing` says what "
                 "to do, such as hold:3, or skip if it isn't in an episode's first step"
             )
         filled = np.where(missing, self._observation[lane], flat)

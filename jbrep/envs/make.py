@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from jbrep.envs.aside import aside
 from jbrep.envs.disturbed import Varied
 from jbrep.envs.domain import Domain
-from jbrep.envs.names import files_of, find_spec, spec_of
+from jbrep.envs.names import INSTANCE, files_of, find_spec, spec_of
 from jbrep.envs.task import Task
 from jbrep.errors import Notice, kind_and_line, refusing
 
@@ -79,7 +79,7 @@ def is_batched(task: Task) -> bool:
 
 def is_one_robot(task: Task, threads: int | None) -> bool:
     """Whether only one instance of the environment may be made, as of a robot that exists once."""
-    return threads == 1 and not is_batched(task)
+    return task.id.startswith(INSTANCE) or (threads == 1 and not is_batched(task))
 
 
 def creator(spec: EnvSpec, vector: bool = False) -> Any:

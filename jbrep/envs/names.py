@@ -29,6 +29,7 @@ _INSTALLED = (  # packages, whose versions stand for their code
     *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")),
     Path(__file__).resolve().parents[1],
 )
+INSTANCE = "instance/"  # begins the ids of users' instances, of which there is one each
 _imported: list[str] = []
 
 
@@ -40,10 +41,11 @@ def find_spec(name: str) -> EnvSpec:
     if ":" in name:
         raise InputError(
             f"the task {name!r} names a module: importing it runs its code, so this is possible on "
-            "a command line only; elsewhere give the id alone, and --import MODULE to the command"
+            "a command line only; elsewhere `import` the module, and give the id alone"
         )
     if name.startswith("dm_control/"):
         _import_shimmy()
+    _register_class_of(name)
     try:
         return gymnasium.spec(SHORT_NAMES.get(name, name))
     except gymnasium.error.Error:
@@ -51,7 +53,7 @@ def find_spec(name: str) -> EnvSpec:
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise InputError(
             f"unknown task {name!r}: {hint}choose one of {', '.join(SHORT_NAMES)}, or an id that "
-            "Gymnasium knows; for one of another package add --import PACKAGE"
+            "Gymnasium knows; for one of another package, `import` it first"
         ) from None
 
 
@@ -62,8 +64,8 @@ def spec_of(task: Task) -> EnvSpec:
     except InputError:
         for module in modules_of(task):
             raise InputError(
-                f"unknown task {task.id!r}: {module} defines it; add --import "
-                f"{shlex.quote(module)}, or the module that registers it: this runs its code"
+                f"unknown task {task.id!r}: {module} defines it; `import` {shlex.quote(module)}, "
+                "or the module that registers it: this runs its code"
             ) from None
         raise
 
@@ -99,7 +101,7 @@ def imported_modules() -> tuple[str, ...]:
 
 def imported(module: str) -> ModuleType | None:
     """A module, if `import_modules` was asked for it."""
-    return sys.modules[module] if module in _imported else None
+    return sys.modules.get(module) if module in _imported else None
 
 
 def is_code(name: object) -> bool:
@@ -119,8 +121,8 @@ def code_named(name: str, what: str) -> Any:
     thing = imported(module)
     if thing is None:
         raise InputError(
-            f"the {what} {name} is code: importing {module} runs it; if you trust it, add "
-            f"--import {module}"
+            f"the {what} {name} is code: importing {module} runs it; if you trust it, `import` "
+            f"{module}"
         )
     with refusing(f"can't make the {what} {name}", (AttributeError,)):
         return attrgetter(path)(thing)
@@ -133,12 +135,57 @@ def name_given(text: str) -> str:
         import_modules([module])
         known = vars(sys.modules[module]).get(name)
         if name not in gymnasium.registry and isinstance(known, type):
-            raise InputError(
-                f"{name} in {module} is a class: register it there, as in gymnasium.register("
-                f"'{name}-v0', entry_point={name}, max_episode_steps=200), then give "
-                f"{module}:{name}-v0"
-            )
+            return taken_for(known)[0]
     return name
+
+
+# environments that no id is registered for
+
+
+def taken_for(given: Any) -> tuple[str, dict[str, Any]]:
+    """The id of what is given for a task, and the arguments that it was made with.
+
+    A class is registered as MODULE/CLASS; an instance that `gymnasium.make` didn't make, or that
+    has more wrappers, is this process's alone.
+    """
+    if isinstance(given, str):
+        return given, {}
+    if isinstance(given, type) and issubclass(given, gymnasium.Env):
+        module, name = given.__module__, f"{given.__module__.replace('.', '-')}/{given.__name__}"
+        if module not in (*_imported, "__main__"):  # other processes import it, too
+            _imported.append(module)
+        return _registered(name, given), {}
+    if not isinstance(given, gymnasium.Env):
+        raise InputError(f"the task is {given!r}: it must be a name, a Task or an environment")
+    made = given.spec
+    if made and made.id in gymnasium.registry and not made.additional_wrappers:
+        usual = {**gymnasium.spec(made.id).kwargs, "render_mode": made.kwargs.get("render_mode")}
+        differing = {n: v for n, v in made.kwargs.items() if n not in usual or usual[n] != v}
+        return made.id, differing
+    name = f"{INSTANCE}{type(given.unwrapped).__name__}"
+    lent = _Lent(given)
+    limit = made.max_episode_steps if made else None
+    return _registered(name, lambda: lent, limit), {}
+
+
+def _registered(name: str, maker: Any, limit: int | None = None) -> str:
+    gymnasium.registry[name] = EnvSpec(name, maker, max_episode_steps=limit)
+    return name
+
+
+class _Lent(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A user's instance, which stays open: it is theirs to close."""
+
+    def close(self) -> None:
+        pass
+
+
+def _register_class_of(name: str) -> None:
+    """Register the class that an id names as MODULE/CLASS, if a user had that module imported."""
+    module, _, kind = name.partition("/")
+    known = getattr(imported(module.replace("-", ".")), kind, None)
+    if name not in gymnasium.registry and isinstance(known, type):
+        taken_for(known)
 
 
 def environment_versions(task: Task) -> dict[str, str]:

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim, flatten_space
-from numpy.typing import NDArray
+from gymnasium.wrappers import TransformAction
+from numpy.typing import ArrayLike, NDArray
 
 from jbrep.envs.aside import in_time
 from jbrep.envs.infos import number_of
@@ -29,7 +30,10 @@ from jbrep.envs.task import (
     Task,
 )
 from jbrep.errors import InputError
+from jbrep.records.record import Finite
 from jbrep.text import words
+
+Bounds = tuple[tuple[Finite, Finite], ...]  # of each number of an action, or one for all
 
 _STEPS = 200  # of each episode that is compared
 _LONGEST = 10_000  # steps in search of a time limit
@@ -38,17 +42,18 @@ _KIND_EPISODES, _KIND_STEPS = 3, 40  # to see which feature is which number of M
 _SAME = 1e-6  # relative difference, of observations in float32
 _TURN = 2 * np.pi + 1e-3  # [rad], as models round it
 
+_ALONE = "obs"  # what the features of an observation without names are called
 _LARGE = 1000.0  # below it, 32 bits hold each number to .00006
 _LEVELS = 4096  # that 32 bits should have of what a feature goes through
 
 
 def probe(
-    env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None
+    env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None, bounds: Bounds = ()
 ) -> "tuple[Task, Signals]":
     """The task of an environment, and what its features went through."""
     env = take(env_id, arguments, max_episode_steps)
     try:
-        found = _task_of(env, env_id, arguments, max_episode_steps)
+        found = _task_of(_bounded(env, env_id, bounds), env_id, arguments, max_episode_steps)
     except BaseException:
         discard(env)
         raise
@@ -119,7 +124,7 @@ def _find_limit(env: Env, env_id: str) -> int:
     played = [[*_play(env, seed, _LONGEST, still=seed == 2)] for seed in (2, 3)]
     cut = {len(steps) - 1 for steps in played if steps[-1].truncated}
     if len(cut) != 1 or max(map(len, played)) - 1 > min(cut):
-        raise InputError(f"{env_id} has no time limit: give one with --episode-steps")
+        raise InputError(f"{env_id} has no time limit: give one with `episode_steps`")
     return cut.pop()
 
 
@@ -134,6 +139,30 @@ def _seed_bits(env: Env) -> SeedBits:
 # spaces
 
 
+def _bounded(env: Env, env_id: str, bounds: Bounds) -> Env:
+    """The environment with bounds of its actions, if any are given: it takes all within as is."""
+    space = env.action_space
+    if not (bounds and isinstance(space, spaces.Box)):
+        return env
+    low, high = within(env_id, np.ravel(space.low), np.ravel(space.high), bounds)
+    ends: Any = (action_in(space, each) for each in (low, high))
+    return TransformAction(env, lambda action: action, spaces.Box(*ends, dtype=space.dtype))
+
+
+def within(env_id: str, low: ArrayLike, high: ArrayLike, bounds: Bounds) -> tuple[Array, Array]:
+    """Bounds of k numbers of an action, one for each or one for all, within those that it has."""
+    own = np.array([low, high], np.float64)
+    if len(bounds) not in (1, own.shape[1]):
+        raise InputError(
+            f"`action_bounds` are {len(bounds)}: {env_id} has actions of {own.shape[1]} numbers"
+        )
+    ends = np.broadcast_to(np.array(bounds, np.float64).T, own.shape)
+    if (ends[0] < own[0]).any() or (ends[1] > own[1]).any() or (ends[0] > ends[1]).any():
+        has = ", ".join(dict.fromkeys(f"{a:g}..{b:g}" for a, b in own.T))
+        raise InputError(f"`action_bounds` of {env_id} must be in order and within its own, {has}")
+    return ends[0].copy(), ends[1].copy()
+
+
 def _checked_action(env_id: str, space: spaces.Space[Any]) -> spaces.Box:
     if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
         raise InputError(
@@ -141,8 +170,7 @@ def _checked_action(env_id: str, space: spaces.Space[Any]) -> spaces.Box:
         )
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         raise InputError(
-            f"{env_id} has actions without bounds, {space}: give its action space finite "
-            f"ones, as in spaces.Box(-1, 1, {space.shape})"
+            f"{env_id} has actions without bounds, {space}: give `action_bounds`, such as -1..1"
         )
     return space
 
@@ -173,7 +201,7 @@ def features_of(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
         )
     sizes = [flatdim(part) for _, part in parts]
     numbers = [
-        (group, group if size == 1 and group != "obs" else f"{group}_{i}")
+        (group, group if size == 1 and group != _ALONE else f"{group}_{i}")
         for group, size in zip(words(name for name, _ in parts), sizes, strict=True)
         for i in range(size)
     ]
@@ -191,7 +219,7 @@ def _parts(name: str, space: spaces.Space[Any]) -> Iterator[tuple[str, spaces.Sp
     elif isinstance(space, spaces.Tuple):
         items = [(f"part{i}", part) for i, part in enumerate(space.spaces)]
     else:
-        yield name or "obs", space
+        yield name or _ALONE, space
         return
     for key, part in items:
         yield from _parts(f"{name}.{key}" if name else str(key), part)
@@ -206,6 +234,17 @@ def _is_image(space: spaces.Space[Any]) -> bool:
 
 
 # kinds of features, by MuJoCo's model: a feature is what it equals in all states of some episodes
+
+
+_TURN_PARTS = "_qw _qx _qy _qz"
+_PARTS = {  # of the positions and velocities of joints, where these have several
+    int(mujoco.mjtJoint.mjJNT_BALL): (_TURN_PARTS, "_velocity_x _velocity_y _velocity_z"),
+    int(mujoco.mjtJoint.mjJNT_FREE): (
+        f"_x _y _z {_TURN_PARTS}",
+        "_velocity_x _velocity_y _velocity_z _angular_velocity_x _angular_velocity_y "
+        "_angular_velocity_z",
+    ),
+}
 
 
 class _Quantity(NamedTuple):
@@ -223,7 +262,7 @@ def _with_kinds(env: Env, features: Sequence[Feature]) -> tuple[Feature, ...]:
     physics = physics_of(env)
     if physics is None:
         return tuple(features)
-    quantities = dict(_quantities(physics.model))
+    quantities, names = dict(_quantities(physics.model)), _state_names(physics.model)
     observations, states = [], []
     for episode in range(_KIND_EPISODES):
         for step in islice(_play(env, episode, _KIND_STEPS), 1, None):
@@ -231,8 +270,25 @@ def _with_kinds(env: Env, features: Sequence[Feature]) -> tuple[Feature, ...]:
             data = physics_of(env).data  # type: ignore[union-attr] # it may be another after a reset
             states.append(np.concatenate((data.qpos, data.qvel)))
     columns = np.array(observations, np.float64).T
-    found = [_match(column, np.array(states), quantities) for column in columns]
+    places = [_match(column, np.array(states)) for column in columns]
+    named = words(  # but what a dictionary's keys name
+        names[place] if place is not None and each.group == _ALONE else each.name
+        for place, each in zip(places, features, strict=True)
+    )
+    features = [each.replace(name=name) for each, name in zip(features, named, strict=True)]
+    found = [None if place is None else quantities.get(place) for place in places]
     return tuple(_as_found(features, found))
+
+
+def _state_names(model: mujoco.MjModel) -> list[str]:
+    """Names of the numbers of the state, qpos and then qvel, after their joints."""
+    joints = [model.joint(i) for i in range(model.njnt)]
+    return [
+        f"{joint.name or f'joint{joint.id}'}{part}"
+        for which in (0, 1)
+        for joint in joints
+        for part in _PARTS.get(joint.type.item(), ("", "_velocity"))[which].split(" ")
+    ]
 
 
 def _quantities(model: mujoco.MjModel) -> Iterator[tuple[int, _Quantity]]:
@@ -268,14 +324,14 @@ def _is_angle(model: mujoco.MjModel, joint: int) -> bool:
     return model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and not several
 
 
-def _match(column: Array, states: Array, quantities: Mapping[int, _Quantity]) -> _Quantity | None:
-    """What a feature is, if it equals one number of the state and no other."""
+def _match(column: Array, states: Array) -> int | None:
+    """Which number of the state a feature is, if it equals one and no other."""
     scale = np.abs(column).max()
     if np.ptp(column) <= _SAME * scale:
         return None  # a constant could be anything
     off = np.abs(states - column[:, None]).max(axis=0)
     equal = np.flatnonzero(off <= _SAME * scale)
-    return quantities.get(int(equal[0])) if len(equal) == 1 else None
+    return int(equal[0]) if len(equal) == 1 else None
 
 
 def _as_found(features: Sequence[Feature], found: Sequence[_Quantity | None]) -> Iterator[Feature]:
@@ -347,6 +403,6 @@ def precision_problems(task: Task, signals: Signals | None) -> Iterator[str]:
         if _LARGE < largest < np.inf and 0 < high - low < _LEVELS * spacing:
             yield (
                 f"{task.name}: {name} is from {low:.10g} to {high:.10g}, but numbers of 32 bits "
-                f"are {spacing:.3g} apart there: give it an offset in --features, such as offset = "
+                f"are {spacing:.3g} apart there: give it an offset in `features`, such as offset = "
                 f"{np.floor(low):.10g}"
             )

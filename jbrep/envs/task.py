@@ -242,6 +242,11 @@ class Task(Record, frozen=True):
         if unknown := set(self.offsets or ()) - set(self.whole.feature_names):
             raise InputError(f"offsets has {min(unknown)}, which is none of its features")
 
+    def __repr__(self) -> str:
+        from jbrep.envs.description import card
+
+        return card(self)
+
     @property
     def whole(self) -> "Task":
         """The task with all that its environment gives, now."""
@@ -273,7 +278,7 @@ class Task(Record, frozen=True):
         if self.timestep is None:
             raise InputError(
                 f"the time step of {self.name} is not known: give it as timestep in a file of "
-                "--features"
+                "`features`"
             )
         return self.timestep
 
@@ -418,11 +423,11 @@ def check_same(expected: Task, actual: Task, what: str) -> None:
         others = set(actual.feature_names) ^ set(expected.feature_names)
         such = f", such as {min(others)}" if others else ""
         raise InputError(
-            f"{what} was made for other features of {actual.name}{such}: give the same --hide, "
-            "--history and --features"
+            f"{what} was made for other features of {actual.name}{such}: give the same `hide`, "
+            "`history` and `features`"
         )
     if (actual.offsets or {}) != (expected.offsets or {}):
         raise InputError(
             f"{what} was made for features of {actual.name} with other offsets: give those in "
-            "--features"
+            "`features`"
         )

@@ -60,7 +60,7 @@ def write(
             on = data.dataset.fingerprint, truth.fingerprint if truth else UNSET
             if known != (*on, _hashes(judged), policy.name if policy else None):
                 other = f"{path} is not an evaluation of these encoders on this data"
-                raise InputError(f"{other}: choose another --out")
+                raise InputError(f"{other}: choose another `out`")
         evaluation = diagnose(judged, data, policy, truth)
         evaluation.write(path)
     return evaluation

@@ -113,4 +113,4 @@ def check_out(path: Path) -> None:
             name = path.with_suffix(SUFFIX)
             raise InputError(f"a recording is a file such as {name}, not {path}")
     elif not path.is_file() or path.read_bytes()[: len(_MAGIC)] != _MAGIC:
-        raise InputError(f"{path} exists and is not a Rerun recording: choose another --out")
+        raise InputError(f"{path} exists and is not a Rerun recording: choose another `out`")

@@ -64,7 +64,7 @@ def inspect(
     if rollout.note:
         tell(rollout.note)
     if traverse and not shown:
-        raise InputError("--traverse moves the units of a latent: give an --encoder")
+        raise InputError("--traverse moves the units of a latent: give an `encoder`")
     if out is None:
         more = [*([shown.name] if shown else []), *(["traverse"] if traverse else [])]
         out = _default(source, rollout.task.slug, f"episode-{episode or 0}", *more)
@@ -86,7 +86,7 @@ def _find(
 ) -> tuple[Rollout, BaseEncoder | None]:
     if source is None or (source.endswith(ENCODER_SUFFIX) and not is_trained(source)):
         if (source is None) == (encoder is None):
-            raise InputError("give a SOURCE to inspect, or one encoder with its --task")
+            raise InputError("give a SOURCE to inspect, or one encoder with its `task`")
         shown = find_alone(encoder if source is None else source, task)
         shown.check_task(task or shown.task)
         return find_episode(_POLICY, episode, task or shown.task), shown

@@ -25,7 +25,7 @@ class Full(ClosedForm, frozen=True, kw_only=True):
     def check(self) -> None:
         super().check()
         if self.on != self.defaults()["on"]:
-            raise InputError(f"{self.name} is on {self.defaults()['on']}: for another, see --kind")
+            raise InputError(f"{self.name} is on {self.defaults()['on']}: for another, see `kind`")
 
     def make(self, data: ScaledDataset) -> Made:
         return Made((), ())

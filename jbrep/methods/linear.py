@@ -87,7 +87,7 @@ def whitening(
         raise InputError(
             f"the covariance of {', '.join(dict.fromkeys(named))} in {data.dataset.folder} is "
             f"singular, as of linear functions of {others}: let one of them pass around the "
-            "encoder, with --keep"
+            "encoder, with `keep`"
         )
     whiten: Array = (vectors / np.sqrt(variances)).T / deviation
     return whiten
@@ -112,7 +112,7 @@ class Directions(Coded, ClosedForm, frozen=True, kw_only=True):
         if constant := data.constant_features:
             raise InputError(
                 f"{constant[0]} is constant in {data.dataset.folder}: let it pass around the "
-                f"encoder, with --keep {constant[0]}"
+                f"encoder, with `keep` {constant[0]}"
             )
         super().check_data(data)
 

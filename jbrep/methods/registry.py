@@ -35,7 +35,7 @@ def with_preset(kind: str, preset: str | None, settings: Mapping[str, Any]) -> d
     if preset is None:
         return dict(settings)
     if not method.presets:
-        raise InputError(f"{kind} has no presets: leave out --preset")
+        raise InputError(f"{kind} has no presets: leave out `preset`")
     return {**choose(preset, method.presets, f"preset of {kind}"), **settings}
 
 
@@ -49,15 +49,15 @@ def each_named(
     """
     method = get_method(kind)
     if name and len(latents) > 1:
-        raise InputError("one --name is for one latent size: give each its own")
+        raise InputError("one `name` is for one latent size: give each its own")
     each = [{**settings, "latent": size} for size in latents] or [settings]
     named = [(name_of(method.of(one)), one) for one in each]  # a mistake shows before data are read
     if seeds is None:
         return [(name, one) for one in each]
     if not method.takes("seed"):
-        raise InputError(f"{kind} has no seed, so all its encoders are the same: leave out --seeds")
+        raise InputError(f"{kind} has no seed, so all its encoders are the same: leave out `seeds`")
     if "seed" in settings:
-        raise InputError("--seed is for one encoder: leave it out, or --seeds")
+        raise InputError("--seed is for one encoder: leave it out, or `seeds`")
     return [
         (of_seed(name or called, seed), {**one, "seed": seed})
         for called, one in named

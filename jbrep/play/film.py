@@ -45,7 +45,7 @@ class Film:
         if self.width > _WIDEST:
             raise InputError(
                 f"{len(self.rollouts)} pictures side by side are {self.width:,} pixels wide: at "
-                f"most {_WIDEST:,} are possible; choose a smaller --size"
+                f"most {_WIDEST:,} are possible; choose a smaller `size`"
             )
         first, *_ = starts = [_start(rollout) for rollout in self.rollouts]
         for rollout, start in zip(self.rollouts, starts, strict=True):

@@ -155,7 +155,7 @@ def standing(
     if header is None:
         raise InputError(
             f"the run in {folder} can't go on: {CHECKPOINT} is missing; choose another folder, "
-            "perhaps with --from"
+            "perhaps with `begin_from`"
         )
     if others := differences(header.versions, versions):
         raise InputError(

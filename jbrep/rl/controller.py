@@ -16,7 +16,7 @@ from jbrep.coordinates import library_of
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder, load
 from jbrep.encoders.layers import ACTIVATIONS, ONNX, Layer, activate, dense, run
-from jbrep.envs.recording import held
+from jbrep.envs.task import most_held
 from jbrep.envs.view import Window
 from jbrep.errors import InputError, choose, listed, refusing
 from jbrep.records.container import Tensors, without
@@ -29,6 +29,7 @@ from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.run_settings import RunSettings
 
 SEAL, NOT_SEALED = "sha256", "0" * 64  # of an ONNX file, in whose place zeros stand then
+EXAMPLE = Path(__file__).parent / "shipped/loop.py"  # a program that runs such a file
 _HIDDEN = "latent_pi.", "mlp_extractor.policy_net.", "mu."  # sequences, numbered from 0
 _LAST = "mu", "action_net"  # single layers after them
 _RENORM_EPSILON = 1e-3  # that CrossQ's batch renormalisation adds to the variance
@@ -91,7 +92,9 @@ class Controller:
         task: says what the observation's numbers and the action's are: names, units, ranges.
         encoder: what the network sees is its latent.
         acting: what is computed of that.
-        action_repeat: calls for which an action is held.
+        action_repeat: control steps for which an action is held.
+        hold: control steps in a row for which the last readings may stand for those that are
+            missing: as many as the task's `missing` says, by default none.
     """
 
     def __init__(
@@ -110,6 +113,9 @@ class Controller:
             high=np.array(self.task.action_high, np.float32),
             is_squashed=ALGORITHMS[settings.algorithm].learns_off_policy,
         )
+        view = self.task.view
+        self._names = self.task.feature_names[: len(view.places) if view else None]
+        self.hold = most_held(self.task.missing or "")
         self._one_row = isinstance(encoder, Encoder)
         self.reset()
 
@@ -119,61 +125,89 @@ class Controller:
 
     def reset(self) -> None:
         """Begin another episode, of any number of robots: the next call chooses an action."""
-        self._act = held(self._chosen, self.action_repeat)
-        self._held: NDArray[np.float32] | None = None  # the action of the last call
+        self._given: NDArray[np.float32] | None = None  # the last observation, with what stood in
+        self._held: NDArray[Any] = np.empty(0)  # the action since then
+        self._missed: NDArray[np.int64] = np.zeros(1, np.int64)  # steps in a row, of each robot
+        self._first = self._step = self._turn = 0
         self._window: Window | None = None
 
-    def __call__(self, observation: ArrayLike) -> NDArray[np.float32]:
+    def __call__(
+        self, observation: ArrayLike | None, step: int | None = None
+    ) -> NDArray[np.float32]:
         """The action (k,) at an observation (d,) in the units of the task's features, less offsets.
 
         Several robots may be given at once, (n, d), for (n, k), the same until `reset`. A policy
         that was trained with a history keeps it: give what the robot shows now. What is refused
         changes nothing: the next call goes on from the one before.
+
+        Args:
+            observation: None where none came in time; NaN stands for a reading that is missing.
+                Those of the step before stand in, for at most `hold` steps in a row.
+            step: the number of this control step; by default the one after the last. Those that
+                were left out are steps without an observation, in which the action was held.
         """
-        try:
-            rows = _numbers(observation)
-        except (TypeError, ValueError, OverflowError, RuntimeError):
-            shown = len(self.task.view.places) if self.task.view else self.task.size
+        given, begins = self._numbers(observation), self._given is None
+        rows, hold = np.atleast_2d(given), 0 if begins else self.hold
+        now = step if step is not None else 0 if begins else self._step + 1
+        first, left_out = (now, 0) if begins else (self._first, now - self._step - 1)
+        if left_out < 0:
+            raise InputError(f"step {now} after step {self._step}: reset() the policy first")
+        lacking = ~np.isfinite(rows)
+        missed = np.where(lacking.any(axis=1), self._missed + left_out + 1, 0)
+        if max(left_out, *missed) > hold:
+            name = self._names[int(np.argwhere(lacking)[0, -1])] if lacking.any() else "observation"
             raise InputError(
-                f"the observation is a {type(observation).__name__}: the policy takes {shown} "
+                f"no finite {name} for more than {hold} steps in a row: the policy's `hold` says "
+                "how many may pass; reset() begins anew"
+            )
+        if self._given is not None:
+            rows = np.where(lacking, np.atleast_2d(self._given), rows)
+        seen = self._with_history(rows, left_out).reshape(*given.shape[:-1], -1)
+        turn = (now - first) // self.action_repeat
+        if begins or turn != self._turn:
+            self._held = self._chosen(seen)
+        self._given, self._missed = rows.reshape(given.shape), missed
+        self._first, self._step, self._turn = first, now, turn
+        return self._held.reshape(*given.shape[:-1], -1).copy()
+
+    def _with_history(self, rows: NDArray[np.float32], left_out: int) -> NDArray[np.float32]:
+        if not self.task.view:
+            return rows
+        if self._window is None or self._given is None:
+            self._window = Window(self.task, len(rows), range(len(self._names)))
+            seen = self._window.begin(range(len(rows)), rows)
+        else:
+            before, moved = np.atleast_2d(self._given), np.ones(len(rows), np.bool_)
+            for given in (*[before] * left_out, rows):
+                seen = self._window.step(moved, np.atleast_2d(self._held), given)
+        return seen.astype(np.float32)
+
+    def _numbers(self, observation: ArrayLike | None) -> NDArray[np.float32]:
+        """An observation's numbers of now, (d,) or (n, d)."""
+        if observation is None and self._given is not None:
+            return np.full_like(self._given, np.nan)
+        names = self._names
+        try:
+            given = _numbers(observation)
+        except (TypeError, ValueError, OverflowError, RuntimeError):
+            raise InputError(
+                f"the observation is a {type(observation).__name__}: the policy takes {len(names)} "
                 "numbers, none of them masked, in one array, as "
                 "gymnasium.spaces.flatten(env.observation_space, observation) gives them"
             ) from None
-        self._check(rows)
-        self._held = self._act(self._with_history(rows))
-        return self._held.copy()
-
-    def _with_history(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        if not self.task.view:
-            return observation
-        rows = np.atleast_2d(observation)
-        if self._window is None or self._held is None:
-            self._window = Window(self.task, len(rows), range(len(self.task.view.places)))
-            seen = self._window.begin(range(len(rows)), rows)
-        else:
-            moved = np.ones(len(rows), np.bool_)
-            seen = self._window.step(moved, np.atleast_2d(self._held), rows)
-        return seen.reshape(*observation.shape[:-1], -1).astype(np.float32)
-
-    def _check(self, observation: NDArray[np.float32]) -> None:
-        shape, view, size = observation.shape, self.task.view, self.task.size
-        names = self.task.feature_names[: len(view.places) if view else size]
-        # now, or with the history that it keeps
-        if len(shape) not in (1, 2) or shape[-1] not in (len(names), size):
+        shape = given.shape  # of now, or with the history that it keeps
+        if len(shape) not in (1, 2) or shape[-1] not in (len(names), self.task.size):
             raise InputError(
                 f"an observation of shape {shape}: the policy takes {len(names)} numbers, of "
                 f"{listed(names)}; or a row of them for each robot"
             )
-        if self._held is not None and shape[:-1] != self._held.shape[:-1]:
-            before = *self._held.shape[:-1], shape[-1]
+        if self._given is not None and given[..., 0].size != self._given[..., 0].size:
+            before = *self._given.shape[:-1], shape[-1]
             raise InputError(
                 f"an observation of shape {shape} after others of {before}: give the same robots, "
                 "or reset() the policy first"
             )
-        finite = np.isfinite(observation[..., : len(names)])
-        if not finite.all():
-            name = names[int(np.argwhere(~finite)[0, -1])]
-            raise InputError(f"{name} is not finite: the policy takes finite numbers")
+        return given[..., : len(names)]
 
     def _chosen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         if observation.ndim == 1 and not self._one_row:
@@ -308,7 +342,7 @@ def described(controller: Controller) -> dict[str, Any]:
     }
 
 
-def _numbers(observation: ArrayLike) -> NDArray[np.float32]:
+def _numbers(observation: Any) -> NDArray[np.float32]:
     """An observation's numbers; a masked one is a reading that is missing."""
     given: NDArray[Any] = np.ma.asanyarray(observation)
     if given.dtype.kind not in "fiub" or np.ma.is_masked(given) or not given.size:

@@ -14,9 +14,10 @@ from jbrep.collecting.policies import Uniform
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.dataset.settings import MAX_ROOT_SEED
 from jbrep.encoders.shipped import UNLEARNED
+from jbrep.envs.description import describe, read_bounds
 from jbrep.envs.domain import Domain, read_ranges
-from jbrep.envs.names import find_spec
-from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES
+from jbrep.envs.names import find_spec, taken_for
+from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES, EpisodeSteps, Id, Missing, Task
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.records.document import Document, read_toml, toml_text
@@ -38,6 +39,7 @@ from jbrep.studies.representations import (
 )
 from jbrep.text import slug
 
+_OF_EACH = "action_bounds", "features", "missing", "hide", "history"
 _MOST_SEEDS = (1 << 16) - 1
 UNIFORM = Uniform.kind
 _DataName = Annotated[
@@ -101,6 +103,32 @@ class Data(Record, frozen=True, kw_only=True):
         return {name: value for name, value in to_plain(self).items() if value not in usual}
 
 
+class Described(Record, frozen=True, kw_only=True):
+    """A task and what is said of it, as `jbrep.describe` takes it; features as their file had."""
+
+    task: str
+    name: Id | None = None  # what tables call it; by default as the task
+    env: Mapping[str, Any] = {}
+    episode_steps: EpisodeSteps | None = None
+    action_bounds: str | None = None
+    features: str | Mapping[str, Any] | None = None
+    missing: Missing | None = None
+    hide: tuple[str, ...] = ()
+    history: Annotated[int, Meta(ge=1, le=1000)] | None = None
+    domain: Mapping[str, Any] = {}
+
+    def check(self) -> None:
+        if isinstance(self.features, str):
+            force_setattr(self, "features", read_toml(Path(self.features)))
+        read_bounds(self.action_bounds)
+        Domain(**read_ranges(self.domain))
+
+    @property
+    def said(self) -> dict[str, Any]:
+        """What is given."""
+        return {name: value for name, value in to_plain(self).items() if value}
+
+
 class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     """Tasks x algorithms x representations x seeds, and the settings that all runs share.
 
@@ -112,7 +140,11 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
 
     tasks: Annotated[
         tuple[str, ...],
-        Meta(min_length=1, description="The Jitterbug's by name, others by their Gymnasium ids."),
+        Meta(
+            min_length=1,
+            description="The Jitterbug's by name, others by their Gymnasium ids; or tables: task, "
+            "and what is said of it.",
+        ),
     ]
     algorithms: Annotated[
         tuple[str, ...],
@@ -152,6 +184,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         ),
     ] = {}
     learners: Mapping[str, Mapping[str, Any]] = {}  # the tables of algorithms, by name
+    described: Mapping[str, Described] = {}  # and those of tasks
     evaluations: Annotated[
         tuple[str, ...],
         Meta(
@@ -181,6 +214,16 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         """The learner of that name: a preset, or one with settings of its own."""
         own = self.learners.get(name)
         return _learner(name, own) if own else Learner.of(name)
+
+    def task(self, name: str) -> Task:
+        """A task as the study describes it, and by the name that the study calls it."""
+        of_all = {"env": self.environment, "episode_steps": self.episode_steps}
+        own = {**of_all, "domain": self.domain or {}} | (
+            self.described[name].said if name in self.described else {}
+        )
+        own.pop("name", None)
+        short = {full: each for each, full in SHORT_NAMES.items()}
+        return describe(own.pop("task", name), **own).replace(name=short.get(name, name))
 
     @property
     def named_data(self) -> Mapping[str, Data]:
@@ -246,10 +289,10 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if (other := folders.setdefault(folder, task)) != task:
                 raise InputError(f"{other} and {task} would share a folder: study one of them here")
         try:
-            json.dumps(self.environment, allow_nan=False)
+            json.dumps([self.environment, to_plain(self.described)], allow_nan=False)
         except (TypeError, ValueError):
             raise InputError(
-                "environment has a date, or a number that is not finite: its values must be text, "
+                "env has a date, or a number that is not finite: its values must be text, "
                 "numbers, true or false, lists or tables"
             ) from None
 
@@ -319,6 +362,8 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         plain = to_plain(self)
         learners, data = plain.pop("learners", {}), plain.pop("data") or {}
         tables = {f"algorithms.{name}": table for name, table in learners.items()}
+        plain.pop("described")
+        tables |= {f"tasks.{name}": each.said for name, each in self.described.items()}
         for name, table in data.items():
             tables[data_key(name)] = {**table, "sets": self.sets(name)}
         return {**plain, **tables}
@@ -330,6 +375,10 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         }
         if learners := given.pop("learners", {}):
             given["algorithms"] = {name: learners.get(name, {}) for name in self.algorithms}
+        given["env"] = given.pop("environment", {})
+        if given.pop("described", None):
+            tasks = ((name, self.described.get(name)) for name in self.tasks)
+            given["tasks"] = [own.said if own else name for name, own in tasks]
         if self.data:
             tables = {name: data.table for name, data in self.named_data.items()}
             given["data"] = tables.get("", tables)
@@ -367,11 +416,13 @@ def read_study(path: Path) -> Study:
     """A study from its TOML file."""
     given = read_toml(path)
     try:
-        if "learners" in given:  # which files of jbrep have beside names
-            raise InputError("unknown 'learners': settings of an algorithm are in algorithms.NAME")
+        for name, where in (("learners", "algorithms.NAME"), ("described", "the list of tasks")):
+            if name in given:  # which files of jbrep have beside names
+                raise InputError(f"unknown {name!r}: such settings are in {where}")
         study = as_study(given)
         for task in study.tasks:
-            find_spec(task)
+            own = study.described.get(task)
+            find_spec(own.task if own else task)
         return study
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -380,9 +431,18 @@ def read_study(path: Path) -> Study:
 def as_study(given: Mapping[str, Any]) -> Study:
     """A study from parsed TOML or JSON; a number of seeds n stands for the seeds 0 to n - 1.
 
-    Tables of algorithms become names and learners, which hold what preset files say.
+    Tables of algorithms become names and learners, which hold what preset files say, and those of
+    tasks names and what is described; what is said of all tasks is said of each.
     """
     given = dict(given)
+    if "env" in given:
+        given["environment"] = given.pop("env")
+    of_all = {name: given.pop(name) for name in _OF_EACH if name in given}
+    if isinstance(tasks := given.get("tasks"), list | tuple):
+        each = [_task(i, of_all, given) for i, given in enumerate(tasks)]
+        given["tasks"] = [own.name or own.task for own in each]
+        if described := {own.name or own.task: own for own in each if {*own.said} - {"task"}}:
+            given["described"] = described
     if type(given.get("seeds")) is int and 0 < given["seeds"] <= _MOST_SEEDS:
         given["seeds"] = [*range(given["seeds"])]
     if isinstance(tables := given.get("algorithms"), dict):
@@ -390,6 +450,12 @@ def as_study(given: Mapping[str, Any]) -> Study:
         given["algorithms"] = [*tables]
         given["learners"] = {name: table for name, table in learners.items() if table}
     return from_plain(given, Study)
+
+
+def _task(number: int, of_all: Mapping[str, Any], given: Any) -> Described:
+    """What is said of a task by its table, or by its name alone, and of all."""
+    own = given if isinstance(given, Mapping) else {"task": taken_for(given)[0]}
+    return from_plain({**of_all, **own}, Described, f"tasks[{number}]")
 
 
 def _read_data(given: Mapping[str, Any] | None) -> Mapping[str, Data] | None:

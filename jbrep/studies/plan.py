@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
-from jbrep.envs.description import describe
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.records.commit import CHANGES, commits, in_work_tree, is_committed
@@ -42,7 +41,7 @@ _GRID = (  # may change
     "evaluations",
     "title",
 )
-_GRID_TABLES = "algorithms.", "data."
+_GRID_TABLES = "algorithms.", "data.", "tasks."
 
 
 class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
@@ -267,9 +266,8 @@ class Plan:
         return [cell for cell in self.cells if not exists(self.folder_of(cell) / RUN)]
 
     def task(self, name: str) -> Task:
-        """A task with the study's arguments, time limit and domain."""
-        study = self.study
-        return describe(name, study.environment, study.episode_steps, domain=study.domain or {})
+        """A task as the study describes it."""
+        return self.study.task(name)
 
     def run(self, cell: Cell) -> Run:
         """What to train."""
@@ -351,11 +349,11 @@ class Plan:
         if self.registration and (differing := self.registration.differences(self.study)):
             raise InputError(
                 f"{self.folder} holds the study registered on {self.registration.date[:10]}, and "
-                f"its file was changed: {differing}; put it back, or choose another --out"
+                f"its file was changed: {differing}; put it back, or choose another `out`"
             )
         if (there := read_plan(self.folder)) and (differing := _differing(there.study, self.study)):
             raise InputError(
-                f"{self.folder} holds another study: {differing}; choose another --out"
+                f"{self.folder} holds another study: {differing}; choose another `out`"
             )
 
     def begin(self) -> None:
@@ -397,7 +395,7 @@ class Plan:
         elif self.registration.sha256 != registration.sha256:
             raise InputError(
                 f"{self.folder} holds the study as it was registered otherwise, on "
-                f"{self.registration.date[:10]}: choose another --out"
+                f"{self.registration.date[:10]}: choose another `out`"
             )
 
     def check_new(self) -> None:

@@ -258,7 +258,7 @@ def prepare(plan: Plan, workers: int = 1) -> None:
             if mistake is None:
                 raise InputError(
                     f"the worker that makes {each} was killed {ATTEMPTS} times, perhaps because "
-                    "memory ran out: try fewer --workers"
+                    "memory ran out: try fewer `workers`"
                 )
 
 

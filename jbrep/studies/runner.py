@@ -37,6 +37,7 @@ CRASHED = "crashed"
 _OWN = STUDY, REGISTRATION, REFERENCE_RETURNS, "data", "encoders", "runs"  # see `make_folder`
 _PATIENCE = 60.0  # seconds, until runs have written their checkpoints
 _WRITE_EVERY = 1.0  # seconds
+_TELL_EVERY = 30.0  # seconds
 
 
 class Outcome(NamedTuple):
@@ -60,7 +61,7 @@ def work(assigned: Assigned, modules: Iterable[str] = ()) -> Outcome | None:
     try:
         make_folder(assigned.folder)
         import_modules(modules)
-        watch = _ProgressFile(assigned.folder, assigned.run.steps)
+        watch = _Progress(assigned)
         result = train(assigned.run, assigned.folder, Session(watch, stop=stop_requested))
     except StoppedError:
         return None
@@ -78,14 +79,21 @@ def _crashed(assigned: Assigned, error: Exception) -> Outcome:
     return Outcome(assigned.name, CRASHED, f"{first_line(error)}; see {path}")
 
 
-class _ProgressFile:
-    """Tells the parent process, through a file, how far a run is."""
+class _Progress:
+    """Tells the parent process, through a file, how far a run is, and now and then a reader."""
 
-    def __init__(self, folder: Path, steps: int) -> None:
-        self._path, self._steps, self._written = folder / PROGRESS, steps, 0.0
+    def __init__(self, assigned: Assigned) -> None:
+        self._path, self._steps = assigned.folder / PROGRESS, assigned.run.steps
+        self._name, self._written, self._told = assigned.name, 0.0, (time.monotonic(), 0)
 
     def __call__(self, history: History, step: int) -> None:
         now = time.monotonic()
+        before, first = self._told
+        if now - before >= _TELL_EVERY:
+            rate = f", {(step - first) / (now - before):,.0f} a second" if first else ""
+            mean = f", mean return {history.means[-1]:.4g}" if history.means else ""
+            say(f"{self._name}: {step:,} of {self._steps:,} steps{rate}{mean}")
+            self._told = now, step
         if step >= self._steps or now - self._written >= _WRITE_EVERY:
             write_note(self._path, str(step))
             self._written = now
@@ -118,7 +126,7 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
 
 def _killed(name: str) -> Outcome:
     reason = f"its worker was killed {ATTEMPTS} times, perhaps because memory ran out"
-    return Outcome(name, CRASHED, f"{reason}: try fewer --workers")
+    return Outcome(name, CRASHED, f"{reason}: try fewer `workers`")
 
 
 def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:

@@ -17,7 +17,7 @@ from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.envs import describe
 
 STEPS = 500  # of each episode
-TASK = describe("face_direction", max_episode_steps=STEPS)
+TASK = describe("face_direction", episode_steps=STEPS)
 SETTINGS = settings(task=TASK, steps=4_000, store_state=False)
 COMMAND = [
     *(sys.executable, "-c", "from jbrep.cli import main; main()", "collect"),

@@ -26,7 +26,7 @@ def settings(task="face_direction", **changes):
 
 def brief(task="face_direction", **changes):
     """Five episodes of 100 steps, each in a shard."""
-    return settings(describe(task, max_episode_steps=100), **{"steps": 500, **changes})
+    return settings(describe(task, episode_steps=100), **{"steps": 500, **changes})
 
 
 def assert_same_files(one, other, *names):

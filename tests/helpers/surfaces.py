@@ -31,7 +31,7 @@ from jbrep.studies.record import RECORD
 from jbrep.studies.runner import run_study
 from jbrep.studies.tables import REFERENCE_RETURNS, RETURNS
 
-PENDULUM = describe("Pendulum-v1", max_episode_steps=20)
+PENDULUM = describe("Pendulum-v1", episode_steps=20)
 environment_versions(PENDULUM)  # or every fork looks through the files of all packages
 SHORT = ("--task", "Pendulum-v1", "--episode-steps", 20, "--steps", 40, "--evaluation-episodes", 1)
 TINY = Study(

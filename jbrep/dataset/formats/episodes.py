@@ -20,7 +20,7 @@ Counts = Counter[tuple[str, str]]  # of what was done: what it was done to, and 
 MOST_RAW = 20_000_000  # rows of what is cut, or brought to another clock
 _PAUSE = 10  # usual steps
 _STAYS = "an episode of its own each; if the flag only stays true, keep its first row"
-_PAUSES = "ten times as long as the usual step or longer, within an episode: --gap ends it there"
+_PAUSES = "ten times as long as the usual step or longer, within an episode: `gap` ends it there"
 
 
 class Incoming(NamedTuple):
@@ -183,7 +183,7 @@ def single(where: str, what: str, values: NDArray[np.float64]) -> NDArray[np.flo
     for step in np.argwhere(~np.isfinite(rounded))[:1, 0]:
         raise InputError(
             f"{where} has a number in its {what} that isn't finite, or beyond 32 bits, at step "
-            f"{step}: correct the data, leave the episode out, or give --missing"
+            f"{step}: correct the data, leave the episode out, or give `missing`"
         )
     return rounded
 
@@ -233,7 +233,7 @@ def _held(episode: Incoming, most: int) -> Incoming:
     for step in np.argwhere(~np.isfinite(episode.action))[:1, 0]:
         raise InputError(
             f"{episode.where} lacks its action at step {step}, which can't be held: leave the "
-            "episode out, or give --missing skip"
+            "episode out, or give `missing` skip"
         )
     seen = np.concatenate((episode.observation, episode.final[None]))
     reward = np.concatenate(([0.0], episode.reward))  # with the observation after it
@@ -245,7 +245,7 @@ def _held(episode: Incoming, most: int) -> Incoming:
         is_first = last[step, column] < 0
         why = "with none before to hold" if is_first else f"beyond hold:{most} of the last one"
         raise InputError(
-            f"{episode.where}: {what} is missing at step {step}, {why}: give --missing skip, hold "
+            f"{episode.where}: {what} is missing at step {step}, {why}: give `missing` skip, hold "
             "it for longer, or leave the episode out"
         )
     filled = np.take_along_axis(rows, last, axis=0)

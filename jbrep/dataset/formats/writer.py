@@ -207,7 +207,7 @@ def _check_alike(source: Source, task: Task) -> None:
         step, expected = source.timestep or 0, task.timestep or 1
         raise InputError(
             f"rows of {source.name} are {step:.4g} s apart, but steps of {task.name} take "
-            f"{expected:.4g} s: give --rate {1 / expected:.6g}"
+            f"{expected:.4g} s: give `rate` {1 / expected:.6g}"
         )
 
 
@@ -252,7 +252,7 @@ def _fitting(source: Source, survey: _Survey, task: Task) -> Task:
     if (longest := max(survey.lengths)) > task.max_episode_steps:
         raise InputError(
             f"{source.name} has an episode of {longest:,} steps, but {task.name} has at most "
-            f"{task.max_episode_steps:,}: give --episode-steps {longest}"
+            f"{task.max_episode_steps:,}: give `episode_steps` {longest}"
         )
     return task.replace(state={}, constants={})
 
