@@ -115,9 +115,9 @@ def test_what_is_refused_changes_nothing(history):
     trained = build(run.settings(encoder), encoder, Path("here"))
     controller, other = controller_of(trained), controller_of(trained)
     refused = [
-        ([0.3], takes),
-        ([0.3] * (2 * history + 2), takes),  # of which it would take the first two
-        (0.3, takes),
+        ([0.3], "takes 2 numbers"),
+        ([0.3] * (2 * history + 2), "takes 2 numbers"),  # of which it would take the first two
+        (0.3, "takes 2 numbers"),
         ([0.1, np.nan], "no finite obs_2 for more than 0 steps in a row"),
     ]
     several = [[0.1, 0.2]] * 3
