@@ -22,7 +22,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 RESUMES = "the same command resumes it"
 _ORDER = (  # of work
-    *("env", "collect", "data", "train-dae", "train-encoder", "evaluate", "encoder", "rl", "tune"),
+    *("env", "check", "collect", "data", "train-dae", "train-encoder", "evaluate", "encoder", "rl", "tune"),
     *("policies", "policy", "evaluate-policy", "study", "report", "inspect", "render", "doctor"),
 )
 _GROUPS = {

@@ -155,7 +155,8 @@ def options_of(source: Any) -> dict[str, Option]:
         if maker := extra.get("made_by"):
             made = options_of(maker)
             main = made.pop(name)
-            own[name] = main._replace(key=main.key._replace(default=default))
+            key, is_first = main.key._replace(default=default), each.kind is _Parameter.POSITIONAL_ONLY
+            own[name] = main._replace(key=key, is_argument=is_first)
             continue
         if each.kind is _Parameter.VAR_KEYWORD:
             for inner in _sources(each):
