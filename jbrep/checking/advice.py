@@ -1,15 +1,14 @@
 """The representation to begin with, and the features file that says what was found."""
 
 import shlex
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import asdict
 
-from jbrep.checking.features import Shapes
-from jbrep.checking.findings import Finding
+from jbrep.checking.features import TURNS, Finding, Shapes
 from jbrep.checking.seen import Seen
 from jbrep.coordinates import make_coordinates
 from jbrep.envs.names import modules_of
@@ -20,17 +19,15 @@ from jbrep.records.document import toml_text
 from jbrep.text import words
 
 _USUAL = 0.01, 0.99  # quantiles of what was seen: a usual range, where none is known
-_UNWANTED = "constant", "copy", "world"  # kinds of findings whose features can be left out
-_FILE = "features.toml"  # what commands call it unless it is written
 
 
 class Advice(NamedTuple):
-    """What to begin with."""
+    """What to begin with: a representation, and the features (D,) of the environment, as found."""
 
     representation: str
     why: str
     command: str
-    features: tuple[Feature, ...]  # of all that the environment gives, as found
+    features: tuple[Feature, ...]
 
 
 def advise(
@@ -42,120 +39,82 @@ def advise(
     where: Path | None,
     data: Path | None,
 ) -> Advice:
-    """Choose a representation, and write its command.
+    """Choose a representation for what was found, and write its command.
 
-    Args:
-        seen: what was played or read.
-        shapes: what its features are like.
-        findings: what is to be changed.
-        joints: names of features.
-        is_symmetric: whether turning and shifting was tried and changes nothing.
-        where: the features file, if it is written.
-        data: the folder of the data set that was read, if one was.
+    Features are called after joints, their file stands `where`, `data` is the folder that was read.
     """
-    task = seen.task
-    features = _found(seen, shapes, joints)
-    needed = any(
-        (new.kind, new.frame) != (old.kind, old.frame)
-        for new, old in zip(features, task.whole.features, strict=True)
-    ) or any(each.kind == "scales" for each in findings)
-    use_file = needed or where is not None
+    task, features = seen.task, _found(seen, shapes, joints)
+    kinds = [[(each.kind, each.frame) for each in some] for some in (features, task.whole.features)]
+    use_file = bool(where or kinds[0] != kinds[1] or any(e.kind == "scales" for e in findings))
     known = task.whole.replace(features=features) if use_file else task.whole
-    new_names = dict(zip(task.whole.feature_names, known.feature_names, strict=True))
-    unwanted = [
-        new_names.get(name, name)
-        for each in findings
-        if each.kind in _UNWANTED and not (each.kind == "world" and is_symmetric)
-        for name in each.features[: 1 if each.kind == "copy" else None]
-    ]
-    before = task.view.hidden if task.view else ()
-    hidden = [*dict.fromkeys((*(new_names[name] for name in before), *unwanted))]
+    names = dict(zip(task.whole.feature_names, known.feature_names, strict=True))
+    hidden = [names[name] for name in (task.view.hidden if task.view else ())]
+    for each in findings:
+        if each.kind == "world" and not is_symmetric:
+            hidden += [names[name] for name in each.features]
     steps = [each.numbers["history"] for each in findings if "history" in each.numbers]
-    history = max(steps, default=task.view.history if task.view else 1)
-    system, why = _system(known, hidden, history, findings, is_symmetric)
-    options = [f"--features={where or _FILE}"] * use_file
-    seen_options = [f"--hide={name}" for name in hidden]
-    seen_options += [f"--history={history}"] * (history > 1)
+    history = max([*steps, task.view.history if task.view else 1])
+    system, why = ("symmetry", "turning and shifting it was tried: nothing else changes")
+    if not is_symmetric:
+        system, why = _system(with_view(known, hidden, history))
+    view = [f"--hide={name}" for name in hidden] + [f"--history={history}"] * (history > 1)
     if data is None:
-        named = ["--task", task.name, *(f"--import={each}" for each in modules_of(task))]
+        file = [f"--features={where or 'features.toml'}"] * use_file
+        named = ["--task", task.name.removesuffix(task.view.suffix if task.view else "")]
+        named += [f"--import={each}" for each in modules_of(task)]
         named += [f"--env={each}" for each in task.given_arguments]
-        line = ["rl", *named, *options, *seen_options, "--encoder", system, "--out", "runs/first"]
-        commands = [line]
+        lines = [["rl", *named, *file, *view, "--encoder", system, "--out", "runs/first"]]
     else:
-        again = [["data", "import", "...", *options, "--out", f"{data}-again"]] * use_file
-        now = f"{data}-again" if use_file else str(data)
-        derive = ["data", "derive", now, *seen_options, "--out", f"{data}-seen"]
-        now = f"{data}-seen" if seen_options else now
-        kind = ["--kind", system] if system != "full" else ["--kind", "identity"]
-        train = ["train-encoder", *kind, "--data", now, "--out", "encoders"]
-        commands = [*again, *([derive] if seen_options else []), train]
-    command = "\n".join(shlex.join(["jbrep", *each]) for each in commands)
+        kind = "identity" if system == "full" else system
+        again = f"{data}-seen" if view else str(data)
+        lines = [["data", "derive", str(data), *view, "--out", again]] if view else []
+        lines += [["train-encoder", "--kind", kind, "--data", again, "--out", "encoders"]]
+    command = "\n".join(shlex.join(["jbrep", *each]) for each in lines)
     return Advice(system, why, command, features)
 
 
-def _system(
-    task: Task,
-    hidden: Collection[str],
-    history: int,
-    findings: Sequence[Finding],
-    is_symmetric: bool,
-) -> tuple[str, str]:
-    if is_symmetric:
-        return "symmetry", "turning and shifting the robot was tried and changes nothing"
+def _system(task: Task) -> tuple[str, str]:
+    """Coordinates where features jump or are longer and turned, else all features."""
     kinds = {each.kind for each in task.features}
     reasons = {
         "angles jump": any(each.is_full_turn for each in task.features),
         "a quaternion has two signs": "quaternion" in kinds,
         "offsets have a length and a direction": "offset" in kinds,
     }
-    why = next((name for name, holds in reasons.items() if holds), None)
     try:
-        if why and make_coordinates(with_view(task, hidden, history), "coordinates"):
+        why = next((name for name, holds in reasons.items() if holds), "")
+        if why and make_coordinates(task, "coordinates"):
             return "coordinates", why
     except InputError:
         pass
-    if any(each.kind == "scales" for each in findings):
-        return "full", "scaled by the usual ranges of the features file"
-    return "full", "no feature jumps"
-
-
-# features as found
+    return "full", "no feature is known to jump"
 
 
 def _found(seen: Seen, shapes: Shapes, joints: Mapping[str, str]) -> tuple[Feature, ...]:
     """All features that the environment gives, with what was found of those that are seen."""
-    task = seen.task
+    task, before = seen.task, ""
     renamed = words(joints.get(name, name) for name in task.whole.feature_names)
     places = {name: i for i, name in enumerate(task.feature_names)}
-    quaternions = {
-        task.feature_names[first + k]: f"attitude{n or ''}"
-        for n, first in enumerate(shapes.quaternions)
-        if task.features[first].kind == "scalar" and _is_w_first(seen, first)
-        for k in range(4)
-    }
-    made, parts, last = list[Feature](), dict[str, int](), ""
+    turned = [first for first in shapes.quaternions if task.features[first].kind == "scalar"]
+    made, parts = list[Feature](), dict[str, int]()
     for old, name in zip(task.whole.features, renamed, strict=True):
-        group = quaternions.get(old.name, old.group)
-        if quaternions and group:  # what a quaternion parts is two groups
-            parts[group] = parts.get(group, 0) + (group != last)
-            last = group
-            group = group if parts[group] == 1 else f"{group}.{parts[group]}"
-        new = old.replace(name=name, group=group)
-        if old.name in quaternions:
+        i = places.get(old.name, -1)
+        first = next((first for first in turned if first <= i < first + 4), None)
+        new = old.replace(name=name) if i < 0 else _as_seen(old.replace(name=name), seen, shapes, i)
+        group = old.group if first is None else f"attitude{first}"
+        if first is not None:
             new = new.replace(kind="quaternion", low=-1.0, high=1.0, bounded=True)
-        elif old.name in places:
-            new = _as_seen(new, seen, shapes, places[old.name])
-        made.append(new)
+        parts[group] = parts.get(group, 0) + (group != before)
+        before = group
+        # what a quaternion parts is two groups
+        is_second = turned and group and parts[group] > 1
+        made.append(new.replace(group=f"{group}.{parts[group]}" if is_second else group))
     return tuple(made)
-
-
-def _is_w_first(seen: Seen, first: int) -> bool:
-    return bool((seen.before[:, first : first + 4] ** 2).mean(axis=0).argmax() != 3)
 
 
 def _as_seen(feature: Feature, seen: Seen, shapes: Shapes, i: int) -> Feature:
     turn = shapes.turns.get(i)
-    if turn and turn.is_radian and feature.kind == "scalar":
+    if turn and turn[:2] in TURNS[:2] and feature.kind == "scalar":
         low, high = turn.low, turn.low + turn.size
         return feature.replace(kind="angle", unit="rad", low=low, high=high, bounded=True)
     low, high = (float(f"{end:.3g}") for end in np.quantile(seen.before[:, i], _USUAL))
@@ -171,8 +130,8 @@ def features_toml(task: Task, features: Sequence[Feature], findings: Sequence[Fi
         "# ranges; docs/coordinates.md says what kinds and frames are.",
     ]
     for old, new in zip(task.whole.features, features, strict=True):
-        lines += ["", *([f"# {old.name}"] if old.name != new.name else [])]
-        lines += [f"# {each.title}: {each.evidence}" for each in findings if old.name in each.features]
-        said = {name: value for name, value in asdict(new).items() if value not in (None, "", False)}
+        told = [f"# {each.kind}: {each.evidence}" for each in findings if old.name in each.features]
+        said = {key: value for key, value in asdict(new).items() if value not in (None, "", False)}
+        lines += ["", *([f"# {old.name}"] if old.name != new.name else []), *told]
         lines += ["[[features]]", toml_text({"unit": "", **said}).rstrip()]
     return "\n".join(lines) + "\n"

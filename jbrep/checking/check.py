@@ -1,17 +1,15 @@
 """A check: what to change of a robot before anything learns, worst first."""
 
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jbrep.checking.advice import Advice, advise, features_toml
-from jbrep.checking.features import Shapes, shapes
-from jbrep.checking.findings import WORST_FIRST, Finding
+from jbrep.checking.features import WORST_FIRST, Finding, Shapes, shapes
 from jbrep.checking.relations import Relations
-from jbrep.checking.seen import CONSTANT, HELD, REPEATS, Played, Seen, held_for, play, read
+from jbrep.checking.seen import REPEATS, Played, Seen, play, read
 from jbrep.coordinates.invariance import NotTheSameError, tried_coordinates
 from jbrep.dataset import Dataset
 from jbrep.envs.task import Task
@@ -21,158 +19,129 @@ from jbrep.stats.intervals import LEVEL, Bounds, mean_within
 from jbrep.text import SIGNIFICANT, Table, counted, duration, facts, interval, wrapped
 
 _NOT_PLAYED = (
-    "rewards of simple policies, how long actions must be held, reproducibility, speed, turning "
-    "and shifting"
+    "not asked of data: what simple policies return, how long actions must be held, whether it is "
+    "reproducible, how fast it steps, and what turning and shifting the robot changes"
 )
-_MILLION = 1_000_000
+_FAR = 2.0  # times as far, from which on holding actions is worth a try
 
 
 class Check(NamedTuple):
     """What was found of a robot or of data."""
 
-    task: Task
     source: str  # "played", or the folder of the data
     findings: list[Finding]  # worst first
     advice: Advice
     notes: list[str]  # what wasn't asked, and why
-    played: Played | None  # None of data
     seen: Seen
     shapes: Shapes
+    played: Played | None  # None of data
 
     @property
     def features_file(self) -> str:
         """What a features file says, in TOML."""
-        return features_toml(self.task, self.advice.features, self.findings)
+        return features_toml(self.seen.task, self.advice.features, self.findings)
 
     def plain(self) -> dict[str, Any]:
-        """All of it but the steps and how fast they were, as plain JSON."""
-        found: dict[str, Any] = {
-            "task": self.task.name,
+        """It as plain JSON, but for speed; of returns mean, ends of its interval, and episodes."""
+        return {
+            "task": self.seen.task.name,
             "source": self.source,
-            "rows": len(self.seen.before),
-            "findings": [each._asdict() | {"title": each.title} for each in self.findings],
+            "steps": len(self.seen.before),
+            "findings": to_plain([{**e._asdict(), "title": e.title} for e in self.findings]),
             "representation": self.advice.representation,
             "because": self.advice.why,
             "command": self.advice.command.split("\n"),
             "notes": self.notes,
+            "reproducible": self.seen.task.reproducible,
+            "returns": {name: [*each] for name, each in self.returns.items()},
+            "spread": {str(repeat): far for repeat, far in self.spread.items()},
         }
-        if self.played:
-            found |= {
-                "reproducible": self.task.reproducible,
-                "steps_per_episode": self.played.limit,
-                "returns": {
-                    name: {"mean": ends[0], "low": ends[1], "high": ends[2], "episodes": count}
-                    for name, (ends, count) in self.returns.items()
-                },
-                "spread": {str(repeat): each for repeat, each in self.spread.items()},
-            }
-        return to_plain(found)
 
     @property
-    def returns(self) -> Mapping[str, tuple[list[float | None], int]]:
-        """Of each policy the mean return with its 95 % interval, and the number of episodes."""
-        bounds = Bounds.of(self.task.return_floor, self.task.return_ceiling)
-        return {
-            name: (mean_within(each, bounds, LEVEL).tolist(), len(each))
-            for name, each in (self.played.returns if self.played else {}).items()
-        }
+    def returns(self) -> dict[str, tuple[float | None, ...]]:
+        """Of each policy the mean return, the ends of its 95 % interval, and the episodes."""
+        bounds = Bounds.of(self.seen.task.return_floor, self.seen.task.return_ceiling)
+        every = self.played.returns.items() if self.played else ()
+        return {n: (*mean_within(e, bounds, LEVEL).tolist(), len(e)) for n, e in every}
 
     @property
     def spread(self) -> dict[int, float]:
         """How far random actions drive the state if held, times as far as those of one step."""
-        relations = Relations(self.seen, self.shapes, 0)
-        deviations = {
-            repeat: relations.inputs(self.seen.after[self.seen.policy == held_for(repeat)])[0].std(0)
-            for repeat in (1, *REPEATS)
-        }
-        moved = deviations[1] > 0
-        return {
-            repeat: float(np.median(each[moved] / deviations[1][moved])) if moved.any() else 1.0
-            for repeat, each in deviations.items()
-        }
+        if not self.played:
+            return {}
+        inputs, far = Relations(self.seen, self.shapes, 0).inputs, dict[int, Any]()
+        for name, repeat in REPEATS.items():
+            far[repeat] = inputs(self.seen.after[self.seen.policy == name])[0].std(axis=0)
+        moves = far[1] > 0
+        return {n: float(np.median(each[moves] / far[1][moves])) for n, each in far.items()}
 
     def text(self, width: int | None = None) -> str:
         """It for a terminal."""
-        first = f"{self.task.name}: {counted(self.task.size, 'feature')}, "
-        first += f"{counted(len(self.seen.before), 'step')} {self.source}"
-        parts = [wrapped(first, width)]
-        if not self.findings:
-            parts.append("nothing to change was found")
+        task, advice = self.seen.task, self.advice
+        size = f"{counted(task.size, 'feature')}, {counted(len(self.seen.before), 'step')}"
+        parts = [wrapped(f"{task.name}: {size} {self.source}", width)]
         for number, each in enumerate(self.findings, 1):
-            about = f"{', '.join(each.features[:4])}{', ...' * (len(each.features) > 4)}"
-            said = {"why": each.evidence, "fix": each.fix}
-            title = f"{number}. {each.title}" + (f": {about}" if about else "")
-            parts.append(f"{wrapped(title, width)}\n{facts(said, width, indent=3)}")
-        if self.played:
-            parts.append(self.returns_table().text(width))
-            parts.append(facts(self.facts(), width, indent=0))
+            said = facts({"why": each.evidence, "fix": each.fix}, width, indent=3)
+            parts.append(f"{wrapped(f'{number}. {each.title}', width)}\n{said}")
+        parts += [] if self.findings else ["nothing to change was found"]
+        parts += (
+            [f"{self.table.text(width)}\n\n{facts(self.facts, width, 0)}"] if self.played else []
+        )
         parts += [wrapped(each, width) for each in self.notes]
-        parts.append(f"begin with {self.advice.representation}: {self.advice.why}")
-        parts[-1] += "".join(f"\n    {line}" for line in self.advice.command.split("\n"))
+        command = advice.command.replace("\n", "\n    ")
+        parts.append(f"begin with {advice.representation}: {advice.why}\n    {command}")
         return "\n\n".join(parts)
 
-    def returns_table(self) -> Table:
-        """What policies return that ignore the state; of constant and held actions the best."""
-        assert self.played
-        whole = self.played.limit == self.task.max_episode_steps
-        told, best = dict[str, tuple[str, ...]](), dict[str, float]()
-        for name, (ends, count) in self.returns.items():
-            family = next((each for each in (CONSTANT, HELD) if name.startswith(each)), "")
-            if family and family in told and (ends[0] or 0) <= best[family]:
-                continue
-            best[family] = ends[0] or 0
-            shown = f"{name} (the best of 4)" if family else name
-            told[family or name] = (shown, interval(ends, SIGNIFICANT), f"{count:,}")
-        cut = "" if whole else f", of {self.played.limit} steps"
-        header = (f"policy{cut}", "mean return [95 % interval]", "episodes")
-        return Table("", header, [*told.values()])
+    @property
+    def table(self) -> Table:
+        """What policies return that ignore the state."""
+        limit, whole = (self.played.limit if self.played else 0), self.seen.task.max_episode_steps
+        cut = f" in {limit} steps" if limit < whole else ""
+        rows = [
+            (name, interval(ends, SIGNIFICANT), f"{count:,}")
+            for name, (*ends, count) in self.returns.items()
+        ]
+        return Table("", (f"return{cut} of", "mean [95 % interval]", "episodes"), rows)
 
+    @property
     def facts(self) -> dict[str, str]:
-        """What is worth to know of play."""
-        assert self.played
-        task, spread = self.task, self.spread
-        best = min(r for r, each in spread.items() if each >= 0.9 * max(spread.values()))
-        moved = ", ".join(f"{repeat} (x{each:.2g})" for repeat, each in spread.items())
-        held = f"how far random actions held for so many steps spread the state: {moved}"
-        if best > 1 and spread[best] > 2:
-            held += f"; try --set action_repeat={best} or coloured noise"
-        cost = duration(_MILLION / self.played.rate)
+        """What else playing tells."""
+        spread, rate = self.spread, self.played.rate if self.played else 1.0
+        held = ", ".join(f"{repeat} (x{each:.2g})" for repeat, each in spread.items())
+        best = min(repeat for repeat, each in spread.items() if each >= 0.9 * max(spread.values()))
+        advice = f"; try --set action_repeat={best}" if spread[best] > _FAR else ""
         return {
-            "holding": held,
-            "reproducible": "yes" if task.reproducible else "no",
-            "speed": f"{self.played.rate:,.0f} steps/s here: 1M steps take {cost} of play",
+            "holding": f"spread of the state by steps that random actions are held: {held}{advice}",
+            "reproducible": "yes" if self.seen.task.reproducible else "no",
+            "speed": f"{rate:,.0f} steps/s here: 1M steps take {duration(1e6 / rate)} of play",
         }
 
 
 def check_task(task: Task, steps: int, seed: int, where: Path | None = None) -> Check:
-    """Play a task and check what was seen."""
+    """Play a task and check what was seen; `where` its features file is written, if it is."""
     seen, played = play(task, steps, seed)
     return _check(seen, "played", seed, where, played, None)
 
 
 def check_data(data: Dataset, steps: int, seed: int, where: Path | None = None) -> Check:
     """Check what is in a data set."""
-    seen = read(data, steps, seed)
-    return _check(seen, f"of {data.folder}", seed, where, None, data.folder)
+    return _check(read(data, steps, seed), f"of {data.folder}", seed, where, None, data.folder)
 
 
 def _check(
     seen: Seen, source: str, seed: int, where: Path | None, played: Played | None, data: Path | None
 ) -> Check:
     known, findings = shapes(seen)
-    notes, turned = list[str](), False
+    notes, is_turned, is_symmetric = [] if played else [_NOT_PLAYED], False, False
     if played:
-        world, is_tried = _by_turning(seen.task)
-        turned = is_tried
-        findings += [world] if world else []
-    else:
-        notes.append(f"not asked of data: {_NOT_PLAYED}")
-    is_symmetric = any(each.kind == "world" for each in findings)
+        world, is_turned = _by_turning(seen.task)
+        is_symmetric = bool(world)
+        findings += world
     relations = Relations(seen, known, seed)
     if relations.is_possible:
-        findings += relations.findings(turned)
+        findings += relations.findings(is_turned)
     else:
-        notes.append("too few steps to learn what predicts what: more --steps, longer episodes")
+        notes.append("too few steps to see what predicts what: take more --steps")
     if played and not seen.task.reproducible:
         why = "with the same seed and actions, a fresh and a used instance differ"
         fix = "draw everything from self.np_random, and reset all that an episode changes"
@@ -180,24 +149,21 @@ def _check(
     findings.sort(key=lambda each: [*WORST_FIRST].index(each.kind))
     joints = played.joints if played else {}
     advice = advise(seen, known, findings, joints, is_symmetric, where, data)
-    return Check(seen.task, source, findings, advice, notes, played, seen, known)
+    return Check(source, findings, advice, notes, seen, known, played)
 
 
-def _by_turning(task: Task) -> tuple[Finding | None, bool]:
-    """Whether the world's frame matters where that can be tried, and whether it could."""
+def _by_turning(task: Task) -> tuple[list[Finding], bool]:
+    """Whether the world's frame doesn't matter, and whether that could be tried."""
     if not any(each.frame == "world" or each.kind == "quaternion" for each in task.features):
-        return None, False
+        return [], False
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             made = tried_coordinates(task, "symmetry")
-    except NotTheSameError:
-        return None, True
-    except InputError:
-        return None, False
-    assert made
-    if told:  # all rewards were the same
-        return None, False
+    except InputError as error:
+        return [], isinstance(error, NotTheSameError)
+    if told or not made:  # all rewards were the same, which tells nothing
+        return [], False
     why = "turned by a quarter and shifted, the robot goes on and is rewarded alike"
     fix = "--encoder symmetry leaves out place and heading"
-    return Finding("world", made.not_decoded, why, fix), True
+    return [Finding("world", made.not_decoded, why, fix)], True

@@ -1,334 +1,258 @@
-"""What tells what, by regressions judged on held-out episodes: what lacks, and what isn't needed."""
+"""What predicts what, judged on held-out episodes: what is missing, and what isn't needed."""
 
-from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.checking.features import Shapes
-from jbrep.checking.findings import Finding, several
+from jbrep.checking.features import Finding, Shapes, several
 from jbrep.checking.seen import Seen
 from jbrep.coordinates.formulas import FORMULAS
 from jbrep.dataset.scaled import sample
 from jbrep.envs.task import Array
+from jbrep.evaluation.evaluation import Score
+from jbrep.evaluation.held_out import explained
 from jbrep.evaluation.regression import Predictor, Problem, fit, ridge
-from jbrep.stats.bootstrap import bootstrap, by_episode, r_squared, variation
+from jbrep.stats.bootstrap import by_episode
 from jbrep.text import counted
 
 PAST = 3  # steps before the current one that a history has
-_MOST_ROWS = 30_000  # to fit, and to judge on
-FEWEST_ROWS = 300
+_FEWEST_ROWS, _MOST_ROWS = 100, 30_000  # to fit, and to judge on
 _HELD_OUT = 0.3  # of the episodes, or of blocks of a few long ones
 _FEWEST_EPISODES, _BLOCKS = 8, 20
-_GAIN, _SURE_GAIN = 0.1, 0.03  # of R^2 by a history: the least, and the least end of its interval
+_GAIN, _SURE_GAIN = 0.1, 0.03  # of R^2 by a history: the least, and between the intervals
 _LEFT = 0.6  # of the error: what a history leaves, at most
 _OF_ACTIONS = 0.7  # of that gain by past actions alone, where they explain it
-_KNOWN = 0.8  # R^2 of the reward, from which on it tells what it needs
-_DEPENDS = 0.003, 0.5  # error by a shuffled feature: share of variation, or of the error before
+_HARDLY, _MOSTLY, _KNOWN, _SPARE = 0.1, 0.5, 0.8, 0.02  # R^2
 _LOSS = 0.01  # of R^2, that what is left out may cost
-_SLOW = 0.2  # of a feature's deviation, by which a place changes in a step
-_ENDS = 0.2  # share of episodes' ends at extreme values, from which on a feature decides them
-_HARDLY, _MOSTLY, _SPARE = 0.1, 0.5, 0.02  # R^2 of rewards
+_DEPENDS = 0.003, 2.0  # error by a shuffled feature: share of variation, times the error before
+_SLOW, _ENDS = 0.2, 0.2  # change of a place by its deviation; share of ends at extreme values
 _SPARSE, _SMALL = 0.05, 0.01  # share of steps whose reward differs by this share of its range
 
 
 class Relations:
-    """Regressions on what was seen, each feature without jumps and known ones left out.
-
-    Args:
-        seen: the steps.
-        shapes: what is known of the features.
-        seed: of the episodes that are held out.
-    """
+    """Regressions on what was seen, of features without jumps, each known once."""
 
     def __init__(self, seen: Seen, shapes: Shapes, seed: int):
-        self.seen, self._shapes = seen, shapes
+        self._seen, self._shapes, self._random = seen, shapes, np.random.default_rng(seed)
+        features = seen.task.features
+        declared = [
+            p.start for p in seen.task.groups.values() if features[p.start].kind == "quaternion"
+        ]
+        self._quaternions = {*shapes.quaternions, *declared}
         rows = np.flatnonzero(seen.step >= PAST)
         groups = seen.episode[rows]
         if len(np.unique(groups)) < _FEWEST_EPISODES:
             groups = np.arange(len(rows)) * _BLOCKS // max(1, len(rows))
-        random = np.random.default_rng(seed)
-        every = random.permutation(np.unique(groups))
+        every = self._random.permutation(np.unique(groups))
         held_out = np.isin(groups, every[: max(1, int(_HELD_OUT * len(every)))])
-        self.train = sample(rows[~held_out], _MOST_ROWS)
-        self.test = sample(rows[held_out], _MOST_ROWS)
-        chosen = groups[np.searchsorted(rows, self.test)]
+        self._train, self._test = (sample(rows[part], _MOST_ROWS) for part in (~held_out, held_out))
+        chosen = groups[np.searchsorted(rows, self._test)]
         self._group = np.unique(chosen, return_inverse=True)[1]
-        self.has_reward = bool(np.isfinite(seen.reward).all())
-        self._random = random
-
-    @property
-    def is_possible(self) -> bool:
-        """Whether there are rows enough."""
-        return min(len(self.train), len(self.test)) >= FEWEST_ROWS * _HELD_OUT / 2
-
-    # numbers without jumps
-
-    def inputs(self, rows: Array, without: Sequence[int] = ()) -> tuple[Array, list[int]]:
-        """Observations (n, d) as numbers to predict from, and the feature that each is of."""
-        made, owners = list[Array](), list[int]()
-        i = 0
-        while i < rows.shape[1]:
-            part, width = [rows[:, i]], 1
-            if i in self._quaternions:
-                part, width = FORMULAS["attitude"].forward(np, [*rows[:, i : i + 4].T], 0.0), 4
-            elif turn := self._shapes.turns.get(i):
-                angle = (rows[:, i] - turn.low) * (2 * np.pi / turn.size)
-                part = [np.cos(angle), np.sin(angle)]
-            elif self.seen.task.features[i].is_angle:
-                part = [np.cos(part[0]), np.sin(part[0])]
-            if i not in self._shapes.idle and i not in without:
-                made += part
-                owners += [i] * len(part)
-            i += width
-        return np.column_stack(made) if made else np.zeros((len(rows), 0)), owners
-
-    @cached_property
-    def _quaternions(self) -> set[int]:
-        declared = [
-            place.start
-            for place in self.seen.task.groups.values()
-            if self.seen.task.features[place.start].kind == "quaternion"
-        ]
-        return {*self._shapes.quaternions, *declared}
-
-    @cached_property
-    def targets(self) -> tuple[Array, list[int]]:
-        """What features change by in each step, those that do, and the feature of each column.
-
-        Rewards come last, for -1, where they are known and vary.
-        """
-        seen, kept = self.seen, list[int]()
-        change = seen.after - seen.before
-        for i, turn in self._shapes.turns.items():
-            change[:, i] -= turn.size * np.round(change[:, i] / turn.size)
-        for i in self._quaternions:
-            place = slice(i, i + 4)
-            along = (seen.before[:, place] * seen.after[:, place]).sum(axis=1, keepdims=True)
-            change[:, place] = np.where(along < 0, -1, 1) * seen.after[:, place]
-            change[:, place] -= seen.before[:, place]
-        kept = [i for i in np.flatnonzero(change.std(axis=0)) if i not in self._shapes.idle]
-        columns = [change[:, kept]]
-        if self.has_reward and seen.reward.std():
-            columns.append(seen.reward[:, None])
-            kept.append(-1)
-        return np.hstack(columns), kept
-
-    # regressions
-
-    def _fit(self, inputs: Sequence[Array], wanted: Sequence[Array]) -> list[Predictor]:
-        """Ridge regressions, and networks of what these leave, of the rows to fit."""
-        lines = [ridge(x[self.train], y[self.train]) for x, y in zip(inputs, wanted, strict=True)]
-        left = [
-            Problem(x[self.train], y[self.train] - line(x[self.train]))
-            for x, y, line in zip(inputs, wanted, lines, strict=True)
-        ]
-
-        def both(line: Predictor, network: Predictor) -> Predictor:
-            return lambda values: line(values) + network(values)
-
-        return [both(line, rest) for line, rest in zip(lines, fit(left), strict=True)]
-
-    def _errors(self, predicted: Array, wanted: Array) -> Array:
-        """Sums of squares by held-out episode, (episodes, k)."""
-        return self._sums((predicted - wanted[self.test]) ** 2)
-
-    def _sums(self, values: Array) -> Array:
-        return by_episode(values, self._group, int(self._group[-1]) + 1)
-
-    def _about(self, wanted: Array) -> tuple[Array, Array, Array]:
-        true = wanted[self.test] - wanted[self.test].mean(axis=0)
-        ones = np.ones((len(self.test), 1))
-        return self._sums(true), self._sums(true**2), self._sums(ones)
-
-    def _r2(self, predicted: Array, wanted: Array) -> Array:
-        """Of each column, (k,)."""
-        residual = self._errors(predicted, wanted).sum(axis=0)
-        total, squares, count = (each.sum(axis=0) for each in self._about(wanted))
-        return np.nan_to_num(r_squared(residual, variation(total, squares, count)))
-
-    def _past(self, values: Array) -> list[Array]:
-        """Values (n, k) of the steps before each, the latest first; wrong in the first ones."""
-        return [np.roll(values, lag, axis=0) for lag in range(1, PAST + 1)]
+        self.is_possible = min(len(self._train), len(self._test)) >= _FEWEST_ROWS
 
     def findings(self, is_turned: bool) -> list[Finding]:
-        """What rewards, and what is observed at once, lack; and places that aren't needed.
-
-        Args:
-            is_turned: whether turning and shifting the robot says already which are.
-        """
+        """What rewards, and what is observed at once, lack; places, unless turning told of them."""
         of_reward = self._of_reward()
         world = None if is_turned or of_reward else self._unneeded()
         return [each for each in (of_reward, self._of_history(), world) if each]
 
-    # rewards
+    # numbers without jumps
+
+    def inputs(self, rows: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Observations (n, d) as numbers (n, p) without jumps, and the feature that each is of."""
+        made, owners, inside = list[Array](), list[int](), list[int]()
+        for i, feature in enumerate(self._seen.task.features):
+            part, turn = [rows[:, i]], self._shapes.turns.get(i)
+            if i in self._quaternions:
+                part = FORMULAS["attitude"].forward(np, [*rows[:, i : i + 4].T], 0.0)
+                inside += [i + 1, i + 2, i + 3]
+            elif turn or feature.is_angle:
+                angle = rows[:, i] * (2 * np.pi / turn.size if turn else 1)
+                part = [np.cos(angle), np.sin(angle)]
+            if i not in (*self._shapes.idle, *inside):
+                made += part
+                owners += [i] * len(part)
+        return np.column_stack(made), np.array(owners)
+
+    @cached_property
+    def _targets(self) -> tuple[Array, list[int]]:
+        """What features change by in each step, those that do, and the feature of each column.
+
+        Rewards come last, for -1, where they are known and vary.
+        """
+        seen = self._seen
+        change = seen.after - seen.before
+        for i, turn in self._shapes.turns.items():
+            change[:, i] -= turn.size * np.round(change[:, i] / turn.size)
+        for i in self._quaternions:
+            now, then = seen.before[:, i : i + 4], seen.after[:, i : i + 4]
+            along = (now * then).sum(axis=1, keepdims=True)
+            change[:, i : i + 4] = np.where(along < 0, -then, then) - now
+        kept = [
+            i for i in np.flatnonzero(change.std(axis=0)).tolist() if i not in self._shapes.idle
+        ]
+        if np.isfinite(seen.reward).all() and np.ptp(seen.reward):
+            return np.column_stack((change[:, kept], seen.reward)), [*kept, -1]
+        return change[:, kept], kept
+
+    @cached_property
+    def _given(self) -> dict[str, Array]:
+        """What is predicted from, (n, p) each: now, with more or less of the past."""
+        action, state = self._seen.action, self.inputs(self._seen.before)[0]
+        actions, states = ([np.roll(x, k, 0) for k in range(1, PAST + 1)] for x in (action, state))
+        now = np.hstack((state, action))
+        acted = np.hstack((now, *actions))
+        return {
+            "now": now,
+            "acted": acted,
+            "all": np.hstack((acted, *states)),
+            "action": action,
+        }
+
+    # regressions
+
+    def _fit(self, *problems: tuple[Array, Array]) -> list[Predictor]:
+        """Ridge regressions, and networks of what these leave, of the rows to fit."""
+        rows = [(given[self._train], wanted[self._train]) for given, wanted in problems]
+        lines = [ridge(*each) for each in rows]
+        left = [Problem(x, y - line(x)) for (x, y), line in zip(rows, lines, strict=True)]
+        return [
+            lambda x, line=line, rest=rest: line(x) + rest(x)  # type: ignore[misc]
+            for line, rest in zip(lines, fit(left), strict=True)
+        ]
+
+    @cached_property
+    def _predictors(self) -> dict[str, Predictor]:
+        """Of all that changes, from what there is now, with all the past, from actions alone."""
+        names = "now", "all", "action"
+        made = self._fit(*((self._given[name], self._targets[0]) for name in names))
+        return dict(zip(names, made, strict=True))
+
+    def _told(self, name: str) -> Array:
+        """What is predicted of the rows that are held out."""
+        return self._predictors[name](self._given[name][self._test])
+
+    def _scores(self, predicted: Array, wanted: Array) -> list[Score]:
+        """R^2 of each column, with an interval over episodes."""
+
+        def sums(rows: NDArray[np.int64], *values: NDArray[np.float64]) -> list[Array]:
+            return [by_episode(each, self._group, int(self._group[-1]) + 1) for each in values]
+
+        return explained(predicted, wanted[self._test], self._test, sums, [1] * wanted.shape[1])
+
+    def _r2(self, predicted: Array, wanted: Array) -> Array:
+        """The same alone, 0 where it is less, (k,)."""
+        return np.array([max(each.value or 0, 0) for each in self._scores(predicted, wanted)])
 
     def _of_reward(self) -> Finding | None:
-        reward = self.seen.reward
-        if not self.has_reward:
-            return None
-        usual, ends = float(np.median(reward)), self.seen.ended.any()
-        if not np.ptp(reward):
-            if ends:  # then how long an episode lasts says something
+        reward, (wanted, places) = self._seen.reward, self._targets
+        usual = float(np.median(reward))
+        if places[-1:] != [-1]:  # how long an episode lasts may say something, if a state ends it
+            if np.isnan(usual) or self._seen.ended.any():
                 return None
             why = f"it is {usual:.4g} at every step, and no state ends an episode"
             return Finding("reward", (), why, "give a reward that depends on the state")
-        varied = float((np.abs(reward - usual) > _SMALL * np.ptp(reward)).mean())
-        if varied < _SPARSE:
-            why = f"{varied:.2%} of the steps have another than {usual:.4g}, the usual one"
-            fix = "shape it, as by the distance that is left; or explore by a policy that gets some"
-            return None if ends else Finding("sparse", (), why, fix, {"share": varied})
-        now, after = self._inputs, self.inputs(self.seen.after)[0]
-        action, wanted = self.seen.action, reward[:, None]
-        given = [np.hstack((now, action, after)), action]
-        whole, alone = (
-            float(self._r2(predict(x[self.test]), wanted)[0])
-            for x, predict in zip(given, self._fit(given, [wanted] * 2), strict=True)
-        )
+        share = float((np.abs(reward - usual) > _SMALL * np.ptp(reward)).mean())
+        if share < _SPARSE:
+            why = f"{share:.2%} of the steps have another one than {usual:.4g}"
+            fix = "shape it, as by the distance that is left, or explore by a policy that gets some"
+            return Finding("sparse", (), why, fix, {"share": share})
+        whole, alone = (self._r2(self._told(name), wanted)[-1] for name in ("now", "action"))
         numbers = {"r2": whole, "r2_of_action": alone}
-        if whole < _HARDLY:
-            why = (
-                "what is observed before and after a step, with the action, predicts it with an "
-                f"R² of {max(whole, 0):.2f}"
-            )
-            return Finding("reward", (), why, "show what it depends on, or reward that", numbers)
-        if alone > _MOSTLY and whole - alone < _SPARE:
-            why = f"the action alone predicts it with an R² of {alone:.2f}; all else adds nothing"
-            return Finding("reward", (), why, "reward what the robot should do", numbers)
+        if whole < _HARDLY or (alone > _MOSTLY and whole - alone < _SPARE):
+            why = f"observation and action predict it with an R² of {whole:.2f}, the action alone "
+            why += f"with {alone:.2f}"
+            fix = "reward what the robot should do, and show what that depends on"
+            return Finding("reward", (), why, fix, numbers)
         return None
 
-    @cached_property
-    def _inputs(self) -> Array:
-        return self.inputs(self.seen.before)[0]
-
-    # histories
-
-    @cached_property
-    def _now(self) -> Array:
-        return np.hstack((self._inputs, self.seen.action))
-
-    @cached_property
-    def _predictors(self) -> list[Predictor]:
-        """Of what becomes of it: from now, with actions before, with a step before, with all."""
-        return self._fit(self._seen_at_once, [self.targets[0]] * 4)
-
-    @cached_property
-    def _seen_at_once(self) -> list[Array]:
-        actions, states = self._past(self.seen.action), self._past(self._inputs)
-        acted = np.hstack((self._now, *actions))
-        short = np.hstack((self._now, actions[0], states[0]))
-        return [self._now, acted, short, np.hstack((acted, *states))]
-
     def _of_history(self) -> Finding | None:
-        wanted, places = self.targets
-        given = [each[self.test] for each in self._seen_at_once]
-        told = [of(values) for of, values in zip(self._predictors, given, strict=True)]
-        errors = [self._errors(each, wanted) for each in told]
-
-        def gains(*sums: Array) -> Array:
-            about = variation(*sums[4:])
-            now, *others = (np.nan_to_num(r_squared(each, about)) for each in sums[:4])
-            return np.stack([each - np.maximum(now, 0) for each in others], axis=-2)
-
-        gained = bootstrap(gains, *errors, *self._about(wanted))
-        (by_actions, _, by_all), sure = gained.value, gained.low[2]
-        before, *_, after = (each.sum(axis=0) for each in errors)
-        hits = np.flatnonzero((by_all > _GAIN) & (sure > _SURE_GAIN) & (after < _LEFT * before))
-        if not len(hits):
+        wanted, places = self._targets
+        told = [self._told("now"), self._told("all")]
+        now, past = (self._r2(each, wanted) for each in told)
+        ends = zip(*(self._scores(each, wanted) for each in told), strict=True)
+        apart = np.array([(after.low or 0) - max(before.high or 0, 0) for before, after in ends])
+        is_hit = (past - now > _GAIN) & (apart > _SURE_GAIN) & (1 - past < _LEFT * (1 - now))
+        hits = np.flatnonzero(is_hit).tolist()
+        if not hits:
             return None
-        names = tuple(self._name(places[hit]) for hit in hits)
-        best = hits[by_all[hits].argmax()]
-        now, _, short, past = (float(self._r2(each, wanted)[best]) for each in told)
-        numbers = {"r2": now, "r2_of_history": past}
+        given = self._given["acted"]
+        (of_acted,) = self._fit((given, wanted))
+        acted = self._r2(of_acted(given[self._test]), wanted)
+        names = tuple(self._seen.task.feature_names[places[i]] for i in hits if places[i] >= 0)
+        best = hits[int((past - now)[hits].argmax())]
+        about = "the reward" if places[best] < 0 else self._seen.task.feature_names[places[best]]
+        numbers = {"r2": now[best], "r2_of_history": past[best]}
         why = (
-            f"the change of {names[hits.tolist().index(best)]} is predicted with an R² of "
-            f"{max(now, 0):.2f}, with the {PAST} steps before it {past:.2f}"
+            f"the change of {about} is predicted with an R² of {now[best]:.2f}, with the {PAST} "
+            f"steps before {past[best]:.2f}"
         )
-        if by_actions[hits].mean() >= _OF_ACTIONS * by_all[hits].mean():
-            lag = self._lag(hits)
-            if lag:
-                why += f"; the action {counted(lag, 'step')} ago matters most"
+        if (acted - now)[hits].mean() >= _OF_ACTIONS * (past - now)[hits].mean():
+            first = self._given["now"].shape[1] - self._seen.action.shape[1]
+            lags = np.arange(first, given.shape[1]).reshape(PAST + 1, -1)
+            errors = [self._shuffled("acted", of_acted, columns)[hits].sum() for columns in lags]
+            lag = int(np.argmax(errors))
             numbers |= {"lag": lag, "history": max(lag, 1) + 1}
+            why += f"; the action {counted(lag, 'step')} before matters most"
             fix = f"--history {numbers['history']}, which shows the last actions, too"
             return Finding("delay", names, why, fix, numbers)
-        numbers["history"] = 2 if short > past - _SPARE else PAST + 1
-        fix = f"--history {numbers['history']}; or show what is missing, such as velocities"
+        numbers["history"] = PAST + 1
+        fix = f"--history {PAST + 1}, or fewer; or show what is missing, such as velocities"
         return Finding("hidden", names, why, fix, numbers)
 
-    def _name(self, place: int) -> str:
-        return "the reward" if place < 0 else self.seen.task.feature_names[place]
-
-    def _lag(self, hits: NDArray[np.int64]) -> int:
-        """How many steps ago the action was that matters most, by shuffling each."""
-        wanted, acted = self.targets[0], self._seen_at_once[1][self.test]
-        count, worst = self.seen.action.shape[1], list[float]()
-        first = acted.shape[1] - (PAST + 1) * count
-        for lag in range(PAST + 1):
-            shuffled = acted.copy()
-            place = slice(first + lag * count, first + (lag + 1) * count)
-            shuffled[:, place] = self._random.permutation(shuffled[:, place])
-            error = self._errors(self._predictors[1](shuffled), wanted).sum(axis=0)
-            worst.append(float((error / wanted[self.test].var(axis=0))[hits].sum()))
-        return int(np.argmax(worst))
+    def _shuffled(self, name: str, of: Predictor, columns: NDArray[np.int64]) -> Array:
+        """Mean squared error by what changes' variance, some columns shuffled, (k,)."""
+        wanted, given = self._targets[0][self._test], self._given[name][self._test]
+        given[:, columns] = self._random.permutation(given[:, columns])
+        error: Array = ((of(given) - wanted) ** 2).mean(axis=0) / wanted.var(axis=0)
+        return error
 
     # places in the world
 
     def _unneeded(self) -> Finding | None:
         """Places and headings that neither the reward nor the change of other features needs."""
-        wanted, places = self.targets
-        present = self._r2(self._predictors[0](self._now[self.test]), wanted)
-        if not places or places[-1] != -1 or present[-1] < _KNOWN:
+        wanted, places = self._targets
+        present = self._r2(self._told("now"), wanted)
+        if places[-1:] != [-1] or present[-1] < _KNOWN:
             return None
-        left = self._ignorable(present)
-        if not left or len(left) == len(places) - 1:
-            return None
-        inputs, _ = self.inputs(self.seen.before, left)
-        kept = [at for at, place in enumerate(places) if place not in left]
-        given = np.hstack((inputs, self.seen.action))
-        (of_less,) = self._fit([given], [wanted[:, kept]])
-        loss = present[kept] - self._r2(of_less(given[self.test]), wanted[:, kept])
-        if loss.max() > _LOSS:
-            return None
-        names = tuple(self.seen.task.feature_names[i] for i in left)
-        why = (
-            f"without {several(names)} the reward and the change of all else are predicted as "
-            f"well, to {max(float(loss.max()), 0):.3f} of R²"
-        )
-        fix = " ".join(f"--hide {name}" for name in names)
-        return Finding("world", names, why, fix, {"loss": float(loss.max())})
-
-    def _ignorable(self, present: Array) -> list[int]:
-        """Features that change slowly, and that nothing else that is needed depends on."""
-        now, of_now, (wanted, places) = self._now, self._predictors[0], self.targets
-        owners = self.inputs(self.seen.before[:1])[1]
-        error = self._errors(of_now(now[self.test]), wanted).sum(axis=0)
-        about = wanted[self.test].var(axis=0) * len(self.test)
+        owners = self.inputs(self._seen.before[:1])[1]
+        least = np.maximum(_DEPENDS[0], _DEPENDS[1] * (1 - present))
         needs = dict[int, set[int]]()  # by feature, the targets that depend on it
-        for i in self._slow(present):
-            shuffled = now[self.test]
-            columns = [at for at, owner in enumerate(owners) if owner == i]
-            shuffled[:, columns] = self._random.permutation(shuffled[:, columns])
-            more = self._errors(of_now(shuffled), wanted).sum(axis=0) - error
-            least = np.maximum(_DEPENDS[0] * about, _DEPENDS[1] * np.minimum(error, about))
-            needs[i] = {places[at] for at in np.flatnonzero(more > least)}
+        for at, i in enumerate(places[:-1]):
+            if present[at] > _MOSTLY and i in owners and self._is_place(at, i):
+                columns = np.flatnonzero(owners == i)
+                more = self._shuffled("now", self._predictors["now"], columns) - (1 - present)
+                needs[i] = {places[k] for k in np.flatnonzero(more > least)}
         left = [*needs]
         while wrong := [i for i in left if needs[i] - {*left}]:
             left = [i for i in left if i not in wrong]
-        return left
+        if not left or len(left) == len(places) - 1:
+            return None
+        state, kept = (
+            self.inputs(self._seen.before)[0],
+            [k for k, i in enumerate(places) if i not in left],
+        )
+        rest, left_out = state[:, ~np.isin(owners, left)], state[:, np.isin(owners, left)]
+        less, needed = np.hstack((rest, self._seen.action)), wanted[:, kept]
+        of_less, of_left = self._fit((less, needed), (rest, left_out))
+        loss = float((present[kept] - self._r2(of_less(less[self._test]), needed)).max())
+        # what the others tell is no place, but the same in other numbers
+        again = self._r2(of_left(rest[self._test]), left_out).max()
+        if loss > _LOSS or again > _MOSTLY:
+            return None
+        names = tuple(self._seen.task.feature_names[i] for i in left)
+        why = (
+            f"without {several(names)} the reward and the change of all else are predicted as "
+            f"well, to {max(loss, 0):.3f} of R²"
+        )
+        return Finding("world", names, why, several(names, "--hide ", " "), {"loss": loss})
 
-    def _slow(self, present: Array) -> Iterator[int]:
-        """Features that others move, a little in each step, and at which episodes don't end."""
-        seen, (wanted, places) = self.seen, self.targets
-        for at, i in enumerate(places):
-            if i < 0 or present[at] < _MOSTLY or i in self._quaternions:
-                continue
-            values = self.seen.before[:, i]
-            if i not in self._shapes.turns and wanted[:, at].std() > _SLOW * values.std():
-                continue
-            low, high = np.quantile(values, (0.02, 0.98))
-            last = seen.after[seen.ended, i]
-            if len(last) and ((last < low) | (last > high)).mean() > _ENDS:
-                continue
-            yield i
+    def _is_place(self, at: int, i: int) -> bool:
+        """Whether a feature moves a little in each step, and episodes don't end at its extremes."""
+        seen, change = self._seen, self._targets[0][:, at]
+        low, high = np.quantile(seen.before[:, i], (0.02, 0.98))
+        last = seen.after[seen.ended, i]
+        is_end = len(last) and ((last < low) | (last > high)).mean() > _ENDS
+        is_slow = i in self._shapes.turns or change.std() < _SLOW * seen.before[:, i].std()
+        return bool(is_slow and not is_end) and i not in self._quaternions

@@ -124,7 +124,7 @@ class Sparse(Arm):
 
 class OfAction(Arm):
     def reward(self, action):
-        return -float(action[0]) ** 2
+        return -(float(action[0]) ** 2)
 
 
 class Unpredictable(Arm):
