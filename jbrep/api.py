@@ -117,7 +117,7 @@ def check(
     /,
     *,
     data: "Annotated[Dataset | str | Path | None, Meta(extra={'metavar': 'FOLDER'})]" = None,
-    steps: Annotated[int, Meta(ge=500, le=10_000_000)] = 44_000,
+    steps: Annotated[int, Meta(ge=500, le=1_000_000)] = 44_000,
     seed: Annotated[int, Meta(ge=0, le=1_000_000)] = 0,
     write: Path | None = None,
     out: Path | None = None,

@@ -47,7 +47,7 @@ def test_policies_that_ignore_the_state_are_beside_their_intervals():
         assert episodes >= 4, name
         assert ends[1] < ends[0] < ends[2], name
     assert {*check.spread} == {1, 2, 4, 8, 16}
-    assert check.spread[8] > 1.5  # its speed adds up what it is pushed by
+    assert check.spread[1] == 1.0 < check.spread[8]  # its speed adds up what it is pushed by
     assert max(map(len, check.text(80).split("\n"))) <= 110  # commands aren't broken
 
 

@@ -51,7 +51,7 @@ def advise(
     hidden = [names[name] for name in (task.view.hidden if task.view else ())]
     for each in findings:
         if each.kind == "world" and not is_symmetric:
-            hidden += [names[name] for name in each.features]
+            hidden += [names[name] for name in each.features if name in names]
     steps = [each.numbers["history"] for each in findings if "history" in each.numbers]
     history = max([*steps, task.view.history if task.view else 1])
     system, why = ("symmetry", "turning and shifting it was tried: nothing else changes")

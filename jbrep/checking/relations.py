@@ -36,9 +36,8 @@ class Relations:
     def __init__(self, seen: Seen, shapes: Shapes, seed: int):
         self._seen, self._shapes, self._random = seen, shapes, np.random.default_rng(seed)
         features = seen.task.features
-        declared = [
-            p.start for p in seen.task.groups.values() if features[p.start].kind == "quaternion"
-        ]
+        firsts = (place.start for place in seen.task.groups.values())
+        declared = (i for i in firsts if features[i].kind == "quaternion")
         self._quaternions = {*shapes.quaternions, *declared}
         rows = np.flatnonzero(seen.step >= PAST)
         groups = seen.episode[rows]
@@ -49,7 +48,8 @@ class Relations:
         self._train, self._test = (sample(rows[part], _MOST_ROWS) for part in (~held_out, held_out))
         chosen = groups[np.searchsorted(rows, self._test)]
         self._group = np.unique(chosen, return_inverse=True)[1]
-        self.is_possible = min(len(self._train), len(self._test)) >= _FEWEST_ROWS
+        is_enough = min(len(self._train), len(self._test)) >= _FEWEST_ROWS
+        self.is_possible = is_enough and len(shapes.idle) < len(features) and bool(self._targets[1])
 
     def findings(self, is_turned: bool) -> list[Finding]:
         """What rewards, and what is observed at once, lack; places, unless turning told of them."""
@@ -89,9 +89,7 @@ class Relations:
             now, then = seen.before[:, i : i + 4], seen.after[:, i : i + 4]
             along = (now * then).sum(axis=1, keepdims=True)
             change[:, i : i + 4] = np.where(along < 0, -then, then) - now
-        kept = [
-            i for i in np.flatnonzero(change.std(axis=0)).tolist() if i not in self._shapes.idle
-        ]
+        kept = np.setdiff1d(np.flatnonzero(change.std(axis=0)), self._shapes.idle).tolist()
         if np.isfinite(seen.reward).all() and np.ptp(seen.reward):
             return np.column_stack((change[:, kept], seen.reward)), [*kept, -1]
         return change[:, kept], kept

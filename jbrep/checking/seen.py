@@ -12,7 +12,7 @@ from jbrep.collecting.policies import Constant, OrnsteinUhlenbeck, Policy, Still
 from jbrep.dataset import Dataset
 from jbrep.envs.lanes import lanes_at_once
 from jbrep.envs.physics import Motion, MotionReader
-from jbrep.envs.recording import held, record
+from jbrep.envs.recording import held, read_nothing, record
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 from jbrep.progress import Progress
@@ -74,12 +74,13 @@ def play(task: Task, steps: int, seed: int) -> tuple[Seen, Played]:
             while len(own) < _FEWEST or (sum(map(len, own)) < share and len(own) < _MOST):
                 seeds = range(first, first := first + lanes.num_lanes)
                 lanes.reset(range(lanes.num_lanes), seeds)
-                act, read = policy.begin(task.replace(timestep=1.0), seeds), MotionReader()
+                act, reader = policy.begin(task.replace(timestep=1.0), seeds), MotionReader()
                 began = time.perf_counter()
-                made = record(lanes, held(act, repeat), bar.update, read)
+                reads = read_nothing if episodes else reader
+                made = record(lanes, held(act, repeat), bar.update, reads)
                 seconds += time.perf_counter() - began
                 if not episodes:
-                    motion = read.motion(made, 0, int(made.length[0]))
+                    motion = reader.motion(made, 0, int(made.length[0]))
                     joints = _joints(task, made.observation[:, 0], motion)
                 for lane, n in enumerate(made.length.tolist()):
                     rows, action = made.observation[: n + 1, lane], made.action[:n, lane]
