@@ -16,12 +16,22 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within
-from jbrep.text import SIGNIFICANT, Table, counted, duration, facts, interval, wrapped
+from jbrep.text import (
+    SIGNIFICANT,
+    Table,
+    counted,
+    duration,
+    facts,
+    interval,
+    terminal_width,
+    wrapped,
+)
 
 _NOT_PLAYED = (
     "not asked of data: what simple policies return, how long actions must be held, whether it is "
     "reproducible, how fast it steps, and what turning and shifting the robot changes"
 )
+_RETURNS = "mean", "low", "high", "episodes"
 _FAR = 2.0  # times as far, from which on holding actions is worth a try
 
 
@@ -36,13 +46,16 @@ class Check(NamedTuple):
     shapes: Shapes
     played: Played | None  # None of data
 
+    def __repr__(self) -> str:
+        return self.text(terminal_width())
+
     @property
     def features_file(self) -> str:
         """What a features file says, in TOML."""
         return features_toml(self.seen.task, self.advice.features, self.findings)
 
     def plain(self) -> dict[str, Any]:
-        """It as plain JSON, but for speed; of returns mean, ends of its interval, and episodes."""
+        """All of it but the steps and how fast they were, as plain JSON."""
         return {
             "task": self.seen.task.name,
             "source": self.source,
@@ -53,7 +66,7 @@ class Check(NamedTuple):
             "command": self.advice.command.split("\n"),
             "notes": self.notes,
             "reproducible": self.seen.task.reproducible,
-            "returns": {name: [*each] for name, each in self.returns.items()},
+            "returns": {n: dict(zip(_RETURNS, e, strict=True)) for n, e in self.returns.items()},
             "spread": {str(repeat): far for repeat, far in self.spread.items()},
         }
 
