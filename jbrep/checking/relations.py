@@ -4,6 +4,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from jbrep.checking.features import Finding, Shapes, several
 from jbrep.checking.seen import Seen
@@ -79,7 +80,8 @@ class Relations:
     def _targets(self) -> tuple[Array, list[int]]:
         """What features change by in each step, those that do, and the feature of each column.
 
-        Rewards come last, for -1, where they are known and vary.
+        Rewards come last, for -1, where they are known and vary: by their ranks, since a few large
+        ones would hide what all others depend on.
         """
         seen = self._seen
         change = seen.after - seen.before
@@ -91,7 +93,8 @@ class Relations:
             change[:, i : i + 4] = np.where(along < 0, -then, then) - now
         kept = np.setdiff1d(np.flatnonzero(change.std(axis=0)), self._shapes.idle).tolist()
         if np.isfinite(seen.reward).all() and np.ptp(seen.reward):
-            return np.column_stack((change[:, kept], seen.reward)), [*kept, -1]
+            ranks = rankdata(seen.reward) / len(seen.reward)
+            return np.column_stack((change[:, kept], ranks)), [*kept, -1]
         return change[:, kept], kept
 
     @cached_property
@@ -159,8 +162,8 @@ class Relations:
         whole, alone = (self._r2(self._told(name), wanted)[-1] for name in ("now", "action"))
         numbers = {"r2": whole, "r2_of_action": alone}
         if whole < _HARDLY or (alone > _MOSTLY and whole - alone < _SPARE):
-            why = f"observation and action predict it with an R² of {whole:.2f}, the action alone "
-            why += f"with {alone:.2f}"
+            why = f"observation and action predict its rank with an R² of {whole:.2f}, "
+            why += f"the action alone with {alone:.2f}"
             fix = "reward what the robot should do, and show what that depends on"
             return Finding("reward", (), why, fix, numbers)
         return None

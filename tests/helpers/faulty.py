@@ -58,16 +58,6 @@ class Wrapped(Arm):
         return {"heading": self.turn(), **self.joints()}
 
 
-class WrappedDegrees(Arm):
-    def observed(self):
-        return {"heading": np.degrees(self.turn()) % 360, **self.joints()}
-
-
-class Scaled(Arm):
-    def observed(self):
-        return {"phase": self.turn() / np.pi, **self.joints()}
-
-
 class Signs(Arm):
     def observed(self):
         half, other = self.turn() / 2, self.tilt
@@ -142,8 +132,6 @@ class Unseeded(Arm):
 FAULTS = {  # what each is found for, and about which features
     Arm: None,
     Wrapped: ("wraps", ("heading",)),
-    WrappedDegrees: ("wraps", ("heading",)),
-    Scaled: ("wraps", ("phase",)),
     Signs: ("signs", ("q0", "q1", "q2", "q3")),
     Degrees: ("degrees", ("tilt_deg",)),
     Copied: ("copy", ("tacho", "speed")),
