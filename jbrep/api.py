@@ -26,6 +26,7 @@ from jbrep.parameters import (
     GivenTask,
     Lanes,
     Normalize,
+    OptionalGivenTask,
     Overrides,
     Preset,
     Retries,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from jbrep.checking.check import Check
     from jbrep.dataset import Dataset
     from jbrep.encoders import Encoder
     from jbrep.envs.task import Task
@@ -113,6 +115,53 @@ class Judged(NamedTuple):
         from jbrep.text import terminal_width
 
         return evaluation_text(self.evaluation, terminal_width())
+
+
+def check(
+    task: OptionalGivenTask = None,
+    /,
+    *,
+    data: "Annotated[Dataset | str | Path | None, Meta(extra={'metavar': 'FOLDER'})]" = None,
+    steps: Annotated[int, Meta(ge=500, le=1_000_000)] = 44_000,
+    seed: Annotated[int, Meta(ge=0, le=1_000_000)] = 0,
+    write: Path | None = None,
+    out: Path | None = None,
+) -> "Check":
+    """Say what to change of a robot before anything learns, worst first.
+
+    TASK is played for about a minute by simple policies: standing still, constant actions, random
+    ones, held and coloured ones. Or `data` are read. Each finding has its evidence and what mends
+    it; at the end stands the representation to begin with.
+
+    Args:
+        data: a data set, or its folder, in place of a task.
+        steps: to play in all, or to read; of each policy at least four episodes are played.
+        seed: of episodes and of what is held out: the same one finds the same.
+        write: a new features file, with names, units, ranges and kinds as found.
+        out: a page with pictures for a browser, a new file.
+    """
+    from jbrep.checking.check import check_data, check_task  # imports torch
+    from jbrep.dataset import Dataset
+    from jbrep.envs.description import as_task
+    from jbrep.records.storage import exists, taken, write_new
+
+    if (task is None) == (data is None):
+        raise InputError("give a task, or else data, a folder from jbrep collect")
+    for path in (write, out):
+        if path and exists(path):
+            raise taken(Path(path))
+    if task is not None:
+        found = check_task(as_task(task), steps, seed, write)
+    else:
+        known = data if isinstance(data, Dataset) else Dataset(data or "")
+        found = check_data(known, steps, seed, write)
+    if write:
+        write_new(Path(write), found.features_file.encode())
+    if out:
+        from jbrep.checking.page import page
+
+        write_new(Path(out), page(found).encode())
+    return found
 
 
 def collect(

@@ -15,6 +15,7 @@ from jbrep.studies.runner import BACKENDS
 
 ROOT = Path(__file__).parent.parent
 LESS = {  # by command: numbers in place of a page's, or beside them
+    "check": {"--steps": "1k"},
     "collect": {"--steps": "1k", "--episode-steps": "100"},
     "train-dae": {"--epochs": "2"},
     "train-encoder": {},

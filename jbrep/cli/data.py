@@ -34,6 +34,15 @@ def env(task: str, /, *, as_json: AsJson = False, **options: Annotated[Any, desc
     say_json(to_plain(known)) if as_json else say(card(known, terminal_width()))
 
 
+@command("check Hopper-v5 --write features.toml")
+def _check(as_json: AsJson = False, **options: Annotated[Any, api.check]) -> None:
+    found = api.check(options.pop("task", None), **options)
+    say_json(found.plain()) if as_json else say(found.text(terminal_width()))
+    for what, path in (("features file", options.get("write")), ("page", options.get("out"))):
+        if path:
+            say(f"{what}: {path}", err=as_json)
+
+
 @command("collect --task face_direction --steps 5M --out data/face")
 def _collect(out: Path, **options: Annotated[Any, api.collect]) -> None:
     _report(out, lambda: api.collect(out=out, **options))

@@ -157,7 +157,10 @@ def options_of(source: Any) -> dict[str, Option]:
         if maker := extra.get("made_by"):
             made = options_of(maker)
             main = made.pop(name)
-            own[name] = main._replace(key=main.key._replace(default=default))
+            is_argument = each.kind is _Parameter.POSITIONAL_ONLY
+            own[name] = main._replace(
+                key=main.key._replace(default=default), is_argument=is_argument
+            )
             continue
         if each.kind is _Parameter.VAR_KEYWORD:
             for inner in _sources(each):

@@ -23,6 +23,10 @@ _SAME = 1e-5  # relative difference of rewards and coordinates, as float32 round
 _SHIFT = (0.5, -0.25)  # [m]
 
 
+class NotTheSameError(InputError):
+    """A task isn't the same for a turned robot."""
+
+
 def tried_coordinates(
     task: Task, system: System, leave_out: Collection[Ingredient] = ()
 ) -> Coordinates | None:
@@ -66,9 +70,9 @@ def check_invariant(coordinates: Coordinates) -> None:
         )
 
 
-def _not_the_same(task: Task, what: str, as_it_is: float, turned: float) -> InputError:
+def _not_the_same(task: Task, what: str, as_it_is: float, turned: float) -> NotTheSameError:
     past = "; what is seen of the past isn't turned" if task.view and task.view.history > 1 else ""
-    return InputError(
+    return NotTheSameError(
         f"{task.name} isn't the same for a turned robot: {what} is {as_it_is:.4g} without a "
         f"quarter turn and {turned:.4g} after one{past}; use coordinates in place of symmetry"
     )

@@ -1,0 +1,137 @@
+"""The representation to begin with, and the features file that says what was found."""
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from msgspec.structs import asdict
+
+from jbrep.checking.features import TURNS, Finding, Shapes
+from jbrep.checking.seen import Seen
+from jbrep.coordinates import make_coordinates
+from jbrep.envs.names import modules_of
+from jbrep.envs.task import Feature, Task
+from jbrep.envs.view import with_view
+from jbrep.errors import InputError
+from jbrep.records.document import toml_text
+from jbrep.text import words
+
+_USUAL = 0.01, 0.99  # quantiles of what was seen: a usual range, where none is known
+
+
+class Advice(NamedTuple):
+    """What to begin with: a representation, and the features (D,) of the environment, as found."""
+
+    representation: str
+    why: str
+    command: str
+    features: tuple[Feature, ...]
+
+
+def advise(
+    seen: Seen,
+    shapes: Shapes,
+    findings: Sequence[Finding],
+    joints: Mapping[str, str],
+    is_symmetric: bool,
+    where: Path | None,
+    data: Path | None,
+) -> Advice:
+    """Choose a representation for what was found, and write its command.
+
+    Features are called after joints, their file stands `where`, `data` is the folder that was read.
+    """
+    task, features = seen.task, _found(seen, shapes, joints)
+    kinds = [[(each.kind, each.frame) for each in some] for some in (features, task.whole.features)]
+    use_file = bool(where or kinds[0] != kinds[1] or any(e.kind == "scales" for e in findings))
+    known = task.whole.replace(features=features) if use_file else task.whole
+    names = dict(zip(task.whole.feature_names, known.feature_names, strict=True))
+    hidden = [names[name] for name in (task.view.hidden if task.view else ())]
+    for each in findings:
+        if each.kind == "world" and not is_symmetric:
+            hidden += [names[name] for name in each.features if name in names]
+    steps = [each.numbers["history"] for each in findings if "history" in each.numbers]
+    history = max([*steps, task.view.history if task.view else 1])
+    system, why = ("symmetry", "turning and shifting it was tried: nothing else changes")
+    if not is_symmetric:
+        system, why = _system(with_view(known, hidden, history))
+    view = [f"--hide={name}" for name in hidden] + [f"--history={history}"] * (history > 1)
+    if data is None:
+        file = [f"--features={where or 'features.toml'}"] * use_file
+        named = ["--task", task.name.removesuffix(task.view.suffix if task.view else "")]
+        named += [f"--import={each}" for each in modules_of(task)]
+        named += [f"--env={each}" for each in task.given_arguments]
+        lines = [["rl", *named, *file, *view, "--encoder", system, "--out", "runs/first"]]
+    else:
+        kind = "identity" if system == "full" else system
+        again = f"{data}-seen" if view else str(data)
+        lines = [["data", "derive", str(data), *view, "--out", again]] if view else []
+        lines += [["train-encoder", "--kind", kind, "--data", again, "--out", "encoders"]]
+    command = "\n".join(shlex.join(["jbrep", *each]) for each in lines)
+    return Advice(system, why, command, features)
+
+
+def _system(task: Task) -> tuple[str, str]:
+    """Coordinates where features jump or are longer and turned, else all features."""
+    kinds = {each.kind for each in task.features}
+    reasons = {
+        "angles jump": any(each.is_full_turn for each in task.features),
+        "a quaternion has two signs": "quaternion" in kinds,
+        "offsets have a length and a direction": "offset" in kinds,
+    }
+    try:
+        why = next((name for name, holds in reasons.items() if holds), "")
+        if why and make_coordinates(task, "coordinates"):
+            return "coordinates", why
+    except InputError:
+        pass
+    return "full", "no feature is known to jump"
+
+
+def _found(seen: Seen, shapes: Shapes, joints: Mapping[str, str]) -> tuple[Feature, ...]:
+    """All features that the environment gives, with what was found of those that are seen."""
+    task, before = seen.task, ""
+    renamed = words(joints.get(name, name) for name in task.whole.feature_names)
+    places = {name: i for i, name in enumerate(task.feature_names)}
+    turned = [first for first in shapes.quaternions if task.features[first].kind == "scalar"]
+    made, parts = list[Feature](), dict[str, int]()
+    for old, name in zip(task.whole.features, renamed, strict=True):
+        i = places.get(old.name, -1)
+        first = next((first for first in turned if first <= i < first + 4), None)
+        new = old.replace(name=name) if i < 0 else _as_seen(old.replace(name=name), seen, shapes, i)
+        group = old.group if first is None else f"attitude{first}"
+        if first is not None:
+            new = new.replace(kind="quaternion", low=-1.0, high=1.0, bounded=True)
+        parts[group] = parts.get(group, 0) + (group != before)
+        before = group
+        # what a quaternion parts is two groups
+        is_second = turned and group and parts[group] > 1
+        made.append(new.replace(group=f"{group}.{parts[group]}" if is_second else group))
+    return tuple(made)
+
+
+def _as_seen(feature: Feature, seen: Seen, shapes: Shapes, i: int) -> Feature:
+    turn = shapes.turns.get(i)
+    if turn and turn[:2] in TURNS[:2] and feature.kind == "scalar":
+        low, high = turn.low, turn.low + turn.size
+        return feature.replace(kind="angle", unit="rad", low=low, high=high, bounded=True)
+    low, high = (float(f"{end:.3g}") for end in np.quantile(seen.before[:, i], _USUAL))
+    if feature.is_angle or feature.low is not None or feature.high is not None or low >= high:
+        return feature
+    return feature.replace(low=low, high=high)
+
+
+def features_toml(task: Task, features: Sequence[Feature], findings: Sequence[Finding]) -> str:
+    """The file of a task's features as found, with what is to be changed as comments."""
+    lines = [
+        f"# The features of {task.name} as jbrep check found them. Correct names, units and usual",
+        "# ranges; docs/coordinates.md says what kinds and frames are.",
+    ]
+    for old, new in zip(task.whole.features, features, strict=True):
+        told = [f"# {each.kind}: {each.evidence}" for each in findings if old.name in each.features]
+        said = {key: value for key, value in asdict(new).items() if value not in (None, "", False)}
+        lines += ["", *([f"# {old.name}"] if old.name != new.name else []), *told]
+        lines += ["[[features]]", toml_text({"unit": "", **said}).rstrip()]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,153 @@
+"""What is checked: steps of whole episodes, played by simple policies or read from a data set."""
+
+import time
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.collecting.policies import Constant, OrnsteinUhlenbeck, Policy, Still, Uniform
+from jbrep.dataset import Dataset
+from jbrep.envs.lanes import lanes_at_once
+from jbrep.envs.physics import Motion, MotionReader
+from jbrep.envs.recording import held, read_nothing, record
+from jbrep.envs.task import Array, Task
+from jbrep.errors import InputError
+from jbrep.progress import Progress
+
+RANDOM, HELD, CONSTANT = "uniform random", "uniform random, held for", "constant:drive="
+REPEATS = {RANDOM: 1, **{f"{HELD} {repeat}": repeat for repeat in (2, 4, 8, 16)}}
+# coloured noise that returns by 5 % in a step, where a step counts as 1 s, and deviates by 0.7
+_NOISE = OrnsteinUhlenbeck(theta=0.05, sigma=0.7 * 0.1**0.5)
+POLICIES: dict[str, tuple[Policy, int]] = {  # with the steps for which each action is held
+    **{name: (Uniform(), repeat) for name, repeat in REPEATS.items()},
+    "coloured noise": (_NOISE, 1),
+    "standing still": (Still(), 1),
+    **{f"{CONSTANT}{drive:g}": (Constant(drive=drive), 1) for drive in (-1.0, -0.5, 0.5, 1.0)},
+}
+_FEWEST, _MOST = 4, 200  # episodes of a policy
+_AT_ONCE, _SHORTEST = 8, 20  # environments; steps to which an episode may be cut
+_SAME, _MOST_ROWS = 1e-6, 0.9  # relative difference of a feature and a joint; the share alike
+_PLACES, _SPEEDS = ("x", "y", "z", "qw", "qx", "qy", "qz"), ("vx", "vy", "vz", "wx", "wy", "wz")
+_FIRST_AXIS = {int(mujoco.mjtJoint.mjJNT_FREE): 0, int(mujoco.mjtJoint.mjJNT_BALL): 3}
+_Columns = tuple[NDArray[Any], ...]
+
+
+class Seen(NamedTuple):
+    """n steps of whole episodes, one episode after the other."""
+
+    task: Task
+    before: Array  # observation before each step, (n, d)
+    after: Array  # and after it, (n, d)
+    action: Array  # (n, k)
+    reward: Array  # (n,), NaN where it isn't known
+    episode: NDArray[np.int64]  # number of each step's episode, (n,)
+    step: NDArray[np.int64]  # and its own in that, from 0, (n,)
+    ended: NDArray[np.bool_]  # whether a state ended the episode there, (n,)
+    policy: NDArray[np.str_]  # what acted, (n,); of data RANDOM, as far as is known
+
+
+class Played(NamedTuple):
+    """What came of playing."""
+
+    returns: dict[str, Array]  # of each policy's episodes
+    limit: int  # steps to which these were cut
+    rate: float  # steps a second
+    joints: dict[str, str]  # what features that are numbered only are called in MuJoCo's model
+
+
+def play(task: Task, steps: int, seed: int) -> tuple[Seen, Played]:
+    """Play each policy for about its share of the steps, at least four episodes, perhaps cut."""
+    share = steps // len(POLICIES)
+    limit = min(task.max_episode_steps, max(_SHORTEST, share // _FEWEST))
+    cut = task.replace(max_episode_steps=limit)
+    at_once = min(_AT_ONCE, max(_FEWEST, share // limit)) if task.reproducible else 1
+    episodes, returns, joints, seconds = list[_Columns](), dict[str, Array](), dict[str, str](), 0.0
+    with (
+        lanes_at_once(cut, at_once, None, 0) as lanes,
+        Progress(total=steps, unit="step", unit_scale=True, leave=False, delay=1) as bar,
+    ):
+        for name, (policy, repeat) in POLICIES.items():
+            own, first = list[Array](), seed << 10
+            while len(own) < _FEWEST or (sum(map(len, own)) < share and len(own) < _MOST):
+                seeds = range(first, first := first + lanes.num_lanes)
+                lanes.reset(range(lanes.num_lanes), seeds)
+                act, reader = policy.begin(task.replace(timestep=1.0), seeds), MotionReader()
+                began = time.perf_counter()
+                reads = read_nothing if episodes else reader
+                made = record(lanes, held(act, repeat), bar.update, reads)
+                seconds += time.perf_counter() - began
+                if not episodes:
+                    motion = reader.motion(made, 0, int(made.length[0]))
+                    joints = _joints(task, made.observation[:, 0], motion)
+                for lane, n in enumerate(made.length.tolist()):
+                    rows, action = made.observation[: n + 1, lane], made.action[:n, lane]
+                    own.append(made.reward[:n, lane].astype(np.float64))
+                    ended = bool(made.terminated[lane])
+                    episodes.append(_columns(len(episodes), rows, action, own[-1], ended, name))
+            returns[name] = np.array([each.sum() for each in own])
+    seen = _joined(task, episodes)
+    return seen, Played(returns, limit, len(seen.reward) / seconds, joints)
+
+
+def read(data: Dataset, steps: int, seed: int) -> Seen:
+    """Episodes of a data set, drawn until they have so many steps."""
+    chosen, total = list[int](), 0
+    lengths = data.episodes["length"].tolist()
+    for number in np.random.default_rng(seed).permutation(len(lengths)).tolist():
+        if lengths[number] and total < steps:
+            chosen.append(number)
+            total += lengths[number]
+    if total < _SHORTEST:
+        raise InputError(f"{data.folder} has {total} steps: a check needs at least {_SHORTEST}")
+    episodes = list[_Columns]()
+    for number in sorted(chosen):
+        episode, n = data.episode(number), min(lengths[number], steps)
+        rows = np.concatenate((episode["observation"], episode.record["final_observation"][None]))
+        reward = episode["reward"] if "reward" in data.columns else np.full(n, np.nan)
+        ended = bool(episode.record["terminated"]) and n == lengths[number]
+        given = rows[: n + 1], episode["action"][:n], reward[:n]
+        episodes.append(_columns(number, *given, ended, RANDOM))
+    return _joined(data.task, episodes)
+
+
+def _columns(
+    number: int, rows: NDArray[Any], action: Array, reward: Array, ended: bool, name: str
+) -> _Columns:
+    rows, step = rows.astype(np.float64), np.arange(len(action))
+    alike = [np.full(len(action), each) for each in (number, name)]
+    return (
+        rows[:-1],
+        rows[1:],
+        action,
+        reward,
+        alike[0],
+        step,
+        ended & (step == step[-1:]),
+        alike[1],
+    )
+
+
+def _joined(task: Task, episodes: Iterable[_Columns]) -> Seen:
+    return Seen(task, *map(np.concatenate, zip(*episodes, strict=True)))
+
+
+def _joints(task: Task, rows: NDArray[np.float32], motion: Motion | None) -> dict[str, str]:
+    """The joints that numbered features are, where each equals one number of MuJoCo's state."""
+    places, speeds, found = list[str](), list[str](), dict[str, str]()
+    if not motion:
+        return found
+    for joint in range(motion.model.njnt):
+        name = motion.model.joint(joint).name or f"joint{joint}"
+        first = _FIRST_AXIS.get(int(motion.model.jnt_type[joint]), len(_PLACES))
+        places += [f"{name}_{axis}" for axis in _PLACES[first:]] or [name]
+        speeds += [f"{name}_{axis}" for axis in _SPEEDS[first:]] or [f"{name}_velocity"]
+    states = np.hstack((motion.qpos, motion.qvel))
+    for feature, column in zip(task.feature_names, rows[: len(states)].T, strict=True):
+        near = np.abs(states - column[:, None]) <= _SAME * np.abs(column).max()
+        alike = np.flatnonzero(near.mean(axis=0) >= _MOST_ROWS)
+        if feature.startswith("obs_") and len(alike) == 1 and np.ptp(column):
+            found[feature] = (*places, *speeds)[alike[0]]
+    return found
