@@ -17,6 +17,7 @@ import wrapt
 from jbrep.lazy import exports
 
 if TYPE_CHECKING:
+    from jbrep.api import clone as clone
     from jbrep.api import collect as collect
     from jbrep.api import evaluate as evaluate
     from jbrep.api import report as report

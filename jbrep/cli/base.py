@@ -22,8 +22,9 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 RESUMES = "the same command resumes it"
 _ORDER = (  # of work
-    *("env", "collect", "data", "train-dae", "train-encoder", "evaluate", "encoder", "rl", "tune"),
-    *("policies", "policy", "evaluate-policy", "study", "report", "inspect", "render", "doctor"),
+    *("env", "collect", "data", "train-dae", "train-encoder", "evaluate", "encoder"),
+    *("rl", "clone", "tune", "policies", "policy", "evaluate-policy"),
+    *("study", "report", "inspect", "render", "doctor"),
 )
 _GROUPS = {
     "data": "Inspect, repair, derive, import and export data sets.",

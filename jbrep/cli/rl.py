@@ -51,6 +51,13 @@ def _rl(
     return False
 
 
+@command("clone --data data/walk --encoder encoders/pca-2.safetensors --out runs/clone")
+def _clone(out: Path, **options: Annotated[Any, api.clone]) -> None:
+    with stoppable(RESUMES):
+        say(repr(api.clone(out=out, **options)))
+    say(str(out))
+
+
 @command(
     "tune --task face_direction --algorithm sac --preset modern --trials 20 --steps 20k "
     "--out runs/tune"

@@ -222,6 +222,7 @@ class Described(msgspec.Struct):
 
     environment: Task
     action_repeat: Annotated[int, Meta(ge=1)]
+    chunk: Annotated[int, Meta(ge=1)] = 1
 
 
 def read_exported(path: Path) -> tuple[Any, Described]:
@@ -255,7 +256,7 @@ def exported_player(path: Path, task: Task | None = None) -> Player:
         raise InputError(f"{path} isn't a policy that jbrep policy export wrote")
     (given,), (made,) = ends
     sizes = given.shape[1], made.shape[1]
-    if sizes != (known.size, known.action_size):
+    if sizes != (known.size, said.chunk * known.action_size):
         raise InputError(
             f"{path} takes {sizes[0]} numbers and gives {sizes[1]}, but {known.name} observes "
             f"{known.size} and acts by {known.action_size}: give its --task"
@@ -267,6 +268,6 @@ def exported_player(path: Path, task: Task | None = None) -> Player:
         return action
 
     def begin(task: Task, seeds: Any) -> Actor:
-        return held(act, said.action_repeat)
+        return held(act, said.action_repeat, said.chunk)
 
     return Player(str(path), known, begin)

@@ -44,7 +44,7 @@ class Acting(NamedTuple):
     statistics: tuple[Any, Any] | None
     # layers to the actions before they are squashed or clipped to [-1, 1]
     network: tuple[Layer, ...]
-    # low, high: bounds of the actions, (k,), to which they are scaled then
+    # low, high: bounds of the actions, (k,), to which they are scaled then; of each of a chunk
     low: Any
     high: Any
     is_squashed: bool  # whether actions are squashed; others are clipped
@@ -106,8 +106,8 @@ class Controller:
         self.acting = Acting(
             statistics=statistics.arrays if statistics else None,
             network=network_of(settings, encoder.latent_size, weights),
-            low=np.array(self.task.action_low, np.float32),
-            high=np.array(self.task.action_high, np.float32),
+            low=np.tile(np.array(self.task.action_low, np.float32), settings.chunk),
+            high=np.tile(np.array(self.task.action_high, np.float32), settings.chunk),
             is_squashed=ALGORITHMS[settings.algorithm].learns_off_policy,
         )
         self._one_row = isinstance(encoder, Encoder)
@@ -119,7 +119,7 @@ class Controller:
 
     def reset(self) -> None:
         """Begin another episode, of any number of robots: the next call chooses an action."""
-        self._act = held(self._chosen, self.action_repeat)
+        self._act = held(self._chosen, self.action_repeat, self.settings.chunk)
         self._held: NDArray[np.float32] | None = None  # the action of the last call
         self._window: Window | None = None
 
@@ -259,7 +259,9 @@ def export(controller: Controller, path: Path, form: str = "onnx") -> None:
     Its input is `observation`, (rows, d) float32 in the units of the task's features; its output is
     `action`, (rows, k) in those of the actuators. `described` is in its metadata, as `jbrep`. Each
     action is to be held for `action_repeat` control steps, which is for the caller to do, as is
-    keeping the states and actions of the steps before for a policy that was trained with a history.
+    keeping the states and actions of the steps before for a policy that was trained with a history,
+    and playing the actions of a `chunk`, which stand one after the other in `action`, (rows, chunk
+    * k).
 
     Args:
         controller: of the policy.
@@ -300,6 +302,7 @@ def described(controller: Controller) -> dict[str, Any]:
         "history": task.view.history if task.view else 1,
         "control_period": task.timestep,  # seconds
         "action_repeat": controller.action_repeat,
+        "chunk": settings.chunk,  # actions that are chosen at once
         "rate": None if period is None else 1 / period,  # actions a second
         "encoder": {"name": controller.encoder.name, "sha256": controller.encoder.fingerprint},
         "learner": settings.learner,

@@ -36,6 +36,52 @@ Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]
 Episodes = Annotated[int, Meta(ge=1, le=MAX_EPISODES)]
 
 
+class CloneSettings(Record, frozen=True, kw_only=True):
+    """How a policy is learned from a data set alone."""
+
+    method: Annotated[
+        Literal["bc", "td3+bc"],
+        Meta(description="Behaviour cloning; or TD3+BC, offline RL, which needs rewards."),
+    ] = "bc"
+    loss: Annotated[
+        Literal["squared", "gaussian"],
+        Meta(
+            description="Of cloning: the squared error of actions; or minus the log-likelihood of "
+            "a Gaussian whose standard deviations are learned."
+        ),
+    ] = "squared"
+    chunk: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=1000,
+            description="Of cloning: actions that are chosen at once and played one after the "
+            "other, before the policy looks again.",
+        ),
+    ] = 1
+    patience: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=10**6,
+            description="Of cloning: epochs in a row without a lower held-out loss that end it.",
+        ),
+    ] = 10
+    alpha: Annotated[
+        float,
+        Meta(
+            gt=0, le=10**6, description="Of TD3+BC: weight of the value beside the data's action."
+        ),
+    ] = 2.5
+
+    def check(self) -> None:
+        of_cloning = {"loss": self.loss != "squared", "chunk": self.chunk > 1}
+        if self.method != "bc" and (
+            given := [name for name, is_set in of_cloning.items() if is_set]
+        ):
+            raise InputError(f"{given[0]} is {getattr(self, given[0])}: with td3+bc leave it out")
+
+
 class TrainingSettings(Record, frozen=True, kw_only=True):
     """How agents are trained and evaluated: what all runs of a study share."""
 

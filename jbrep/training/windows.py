@@ -77,6 +77,20 @@ class Windows:
         """Of each window the first row (n, size), its action (n, k), and the next row (n, size)."""
         return self.rows(numbers), self.actions(numbers)[:, 0], self.rows(numbers, 1)
 
+    def after(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """The row after each window's first, (n, size), which may be the end of the episode.
+
+        And whether a state ended the episode there, (n,).
+        """
+        rows, places, ended = self._following
+        following = places.index_select(0, self._first(numbers))
+        return rows.index_select(0, following), ended.index_select(0, following)
+
+    @property
+    def first_rows(self) -> NDArray[np.int64]:
+        """The first row of each window, by its number in the data set, (n,)."""
+        return self._rows[self._first(self.numbers).numpy(force=True)]
+
     def rewards(self, numbers: Tensor, count: int = 1) -> Tensor:
         """The mean of the first rewards of each window, (n,)."""
         first = self._first(numbers)
@@ -86,6 +100,26 @@ class Windows:
     @cached_property
     def _scaled(self) -> Tensor:
         return torch.from_numpy(self._data.load(self._rows)).to(self.device)
+
+    @cached_property
+    def _following(self) -> tuple[Tensor, Tensor, Tensor]:
+        """All rows with those at the ends of episodes behind them, (rows + episodes, size).
+
+        Of each row the place there of the next one, (rows,); of each place, whether a state ended
+        its episode there, (rows + episodes,).
+        """
+        episodes, count = self._data.dataset.episodes, len(self._rows)
+        lasts = np.cumsum(episodes["length"], dtype=np.int64) - 1
+        own = np.isin(lasts, self._rows)
+        places = np.arange(1, count + 1)
+        places[np.searchsorted(self._rows, lasts[own])] = count + np.arange(own.sum())
+        finals = torch.from_numpy(self._data.scale(episodes["final_observation"][own]))
+        ended = np.concatenate((np.zeros(count), episodes["terminated"][own]))
+        return (
+            torch.cat((self._scaled, finals.to(self.device))),
+            torch.from_numpy(places).to(self.device),
+            torch.from_numpy(ended.astype(np.float32)).to(self.device),
+        )
 
     @cached_property
     def _action(self) -> Tensor:
