@@ -58,11 +58,13 @@ class Agent(NamedTuple):
         folder: of the run.
         record: what run.json says: settings, status, seconds.
         encoder: of the agent, if it is a user's own object.
+        clone: if it was learned from data: held-out errors, and the returns of data and policy.
     """
 
     folder: Path
     record: "RunRecord"
     encoder: Any = None
+    clone: "CloneRecord | None" = None
 
     @property
     def returns(self) -> "NDArray[np.float64]":
@@ -88,36 +90,8 @@ class Agent(NamedTuple):
         what = f"{settings.learner} on {settings.representation}, {settings.task}"
         if self.record.status != FINISHED:
             return f"Agent({what}: {self.record.reason})"
-        return f"Agent({what}: {returns_text(self.returns)}; {str(self.folder)!r})"
-
-
-class Clone(NamedTuple):
-    """A policy that was learned from a data set.
-
-    Attributes:
-        agent: the same as that of a run: `returns`, `policy`, `folder`.
-        record: what clone.json says: held-out errors, and the returns of data and policy.
-    """
-
-    agent: Agent
-    record: "CloneRecord"
-
-    @property
-    def returns(self) -> "NDArray[np.float64]":
-        """Returns of the episodes that it played; none if there was no environment."""
-        return self.agent.returns
-
-    @property
-    def policy(self) -> "Controller":
-        """What it has learned, as a function of observations."""
-        return self.agent.policy
-
-    def __repr__(self) -> str:
-        from jbrep.text import terminal_width
-
-        settings = self.agent.record.settings
-        what = f"{settings.learner} on {settings.representation}, {settings.task}"
-        return f"{what}: {self.record.card(terminal_width())}"
+        told = returns_text(self.returns) if len(self.returns) else "not played"
+        return f"Agent({what}: {told}; {str(self.folder)!r})"
 
 
 class Judged(NamedTuple):
@@ -392,7 +366,7 @@ def clone(
     threads: Threads = None,
     device: str = "cpu",
     **settings: Annotated[Any, CloneSettings],
-) -> Clone:
+) -> Agent:
     """Learn a policy from a data set alone: clone the one that acted, or improve on it.
 
     What is learned from 80 % of the episodes is judged on the others, by its actions. Cloning keeps
@@ -422,13 +396,11 @@ def clone(
     from jbrep.cloning.clone import Job, learn  # imports torch
 
     of_run = {"seed": seed, "final_episodes": episodes, "device": device}
-    learned = learn(Job.of(known, encoder, how, overrides, steps, **of_run), Path(out), threads)
-    if not learned.is_new:
-        _note(f"the policy in {out} was complete already: nothing was done")
-    if learned.record.note:
-        _note(learned.record.note)
-    own = None if isinstance(encoder, str | Path) else encoder
-    return Clone(Agent(Path(out), learned.run, own), learned.record)
+    job = Job.of(known, encoder, how, overrides, steps, **of_run)
+    run, record = learn(job, Path(out), threads)
+    if record.note:
+        _note(record.note)
+    return Agent(Path(out), run, None if isinstance(encoder, str | Path) else encoder, record)
 
 
 def check_learner(

@@ -14,7 +14,7 @@ from jbrep.errors import StoppedError
 from jbrep.parameters import NOTHING, Algorithm, DrawnTask, Normalize, Overrides, Preset, Seen
 from jbrep.rl.settings import Episodes, Seed
 from jbrep.rl.settings import Steps as TrainingSteps
-from jbrep.text import returns_text, rounded
+from jbrep.text import returns_text, rounded, terminal_width
 
 _BESIDE = 10  # episodes of policies that don't learn
 
@@ -54,8 +54,9 @@ def _rl(
 @command("clone --data data/walk --encoder encoders/pca-2.safetensors --out runs/clone")
 def _clone(out: Path, **options: Annotated[Any, api.clone]) -> None:
     with stoppable(RESUMES):
-        say(repr(api.clone(out=out, **options)))
-    say(str(out))
+        agent = api.clone(out=out, **options)
+    assert agent.clone
+    say(f"{agent.record.settings.name}: {agent.clone.card(terminal_width())}\n{out}")
 
 
 @command(

@@ -43,7 +43,7 @@ from jbrep.rl.policy import Trained, build, pack_whole
 from jbrep.rl.presets import LINEAR, MODERN, argument
 from jbrep.rl.run import Run
 from jbrep.rl.run_settings import Cloned, RunSettings
-from jbrep.rl.settings import CloneSettings, Line
+from jbrep.rl.settings import BC, CloneSettings, Line
 from jbrep.rl.training import packages, write_tables
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within
 from jbrep.text import Table, counted, interval, number, r2_text
@@ -53,10 +53,10 @@ from jbrep.training.windows import Windows, count_windows, watched_windows
 CLONE = "clone.json"
 _CHECKPOINT = "training.safetensors"  # until the training has ended
 _SAVE_EVERY = 10.0  # seconds between checkpoints, at least
-_STEPS = {"bc": 20_000, "td3+bc": 100_000}  # gradient steps where nothing is said
+_STEPS = {BC: 20_000, "td3+bc": 100_000}  # gradient steps where nothing is said
 _AT_ONCE = 10  # episodes that are played
 _TIMES = 10  # parts of the longest episode
-_FOR_NETWORK = ("net_arch", "activation_fn", "learning_rate", "batch_size")
+_FOR_NETWORK, _FOR_ALL = ("net_arch", "activation_fn"), ("learning_rate", "batch_size")
 _FOR_TD3 = ("gamma", "tau", "policy_delay", "target_policy_noise", "target_noise_clip")
 _BASES: dict[str, tuple[str, dict[str, Any]]] = {  # whose policy it is, by the loss
     "squared": ("td3", {}),
@@ -102,17 +102,13 @@ class CloneRecord(Document, frozen=True, kw_only=True):
 
     def card(self, width: int | None) -> str:
         """What a reader wants to know of it."""
-        rows = [(each.name, number(each.mse, ".4f"), r2_text(each.r2)) for each in self.parts]
+        parts = self.error, *(self.actions if len(self.actions) > 1 else ()), *self.times
+        rows = [(each.name, number(each.mse, ".4f"), r2_text(each.r2)) for each in parts]
         kept = f"epoch {self.best_epoch} of {len(self.epochs)} is kept; held-out actions:"
         lines = [kept, Table("", ("", "error", "R²"), rows).text(width)]
         lines += [f"returns: policy {self.policy}"] if self.policy else []
         lines += [f"returns: data {self.data}"] if self.data else []
         return "\n".join(lines)
-
-    @property
-    def parts(self) -> tuple[Part, ...]:
-        """All parts, the whole first."""
-        return (self.error, *(self.actions if len(self.actions) > 1 else ()), *self.times)
 
 
 class Job(NamedTuple):
@@ -122,6 +118,7 @@ class Job(NamedTuple):
     encoder: BaseEncoder
     settings: RunSettings
     how: Cloned
+    given: dict[str, Any]  # settings of the training, by stable-baselines3's names
 
     @classmethod
     def of(
@@ -137,20 +134,17 @@ class Job(NamedTuple):
 
         The run that it is written as is one of the algorithm whose policy it has.
         """
-        _check_rewards(data, how)
         algorithm, usual = _BASES[how.loss]
-        known = (*_FOR_NETWORK, *(_FOR_TD3 if how.method != "bc" else ()))
+        of_training = (*_FOR_ALL, *(_FOR_TD3 if how.method != BC else ()))
         for name, value in overrides.items():
-            if name not in known:
+            if name not in (known := (*_FOR_NETWORK, *of_training)):
                 raise InputError(f"{how.method} has no setting {name!r}: it has {', '.join(known)}")
             if str(value).startswith(LINEAR):
-                raise InputError(
-                    f"{name} is {value}: a schedule isn't possible here, give a number"
-                )
-        words = [how.method, *(["gaussian"] if how.loss == "gaussian" else [])]
-        words += [f"chunk{how.chunk}"] if how.chunk > 1 else []
+                raise InputError(f"{name} is {value}: it must be a number here, not a schedule")
+        label = "-gaussian" if how.loss == "gaussian" else ""
+        label += f"-chunk{how.chunk}" if how.chunk > 1 else ""
         learner = Learner(
-            name=usual_name("-".join(words), overrides),
+            name=usual_name(f"{how.method}{label}", overrides),
             algorithm=algorithm,
             preset=MODERN,
             overrides={**usual, **overrides, "normalize": True},
@@ -159,82 +153,61 @@ class Job(NamedTuple):
         of_run |= {"steps": steps, "evaluate_every": steps}
         of_run["evaluation_episodes"] = min(_AT_ONCE, of_run["final_episodes"])
         run = Run(task=data.task, learner=learner, encoder=encoder, **of_run)
-        found = run.find_encoder()
-        settings, chosen = run.settings(found), learner.hyperparameters
-        own = {name: argument(algorithm, chosen, name) for name in known if name in _SETTABLE}
-        chosen = chosen.replace(algorithm_kwargs=own, noise=None, num_envs=1)
+        found, chosen = run.find_encoder(), learner.hyperparameters
+        given = {name: argument(algorithm, chosen, name) for name in of_training}
         cloned = Cloned(**to_plain(how), data=data.fingerprint)
-        return cls(data, found, settings.replace(hyperparameters=chosen, cloned=cloned), cloned)
-
-    def setting(self, name: str) -> Any:
-        """A hyperparameter of stable-baselines3's."""
-        return self.settings.hyperparameters.algorithm_kwargs[name]
-
-
-_SETTABLE = {"learning_rate", "batch_size", *_FOR_TD3}
-
-
-def _check_rewards(data: Dataset, how: CloneSettings) -> None:
-    if how.method == "bc":
-        return
-    if data.manifest.settings.unrewarded:
-        raise InputError(
-            f"{how.method} needs rewards, and {data.folder} has none: jbrep data derive --reward "
-            "gives some, or take the method bc"
+        settings = run.settings(found).replace(
+            hyperparameters=chosen.replace(algorithm_kwargs=given, noise=None, num_envs=1),
+            cloned=cloned,
         )
-    if not len(data) or np.ptp(np.asarray(data["reward"])) == 0:
-        raise InputError(f"{how.method} needs rewards that vary: those of {data.folder} don't")
+        return cls(data, found, settings, cloned, given)
 
 
-class Learned(NamedTuple):
-    """A policy in a run's folder, and what is known of it."""
-
-    run: RunRecord
-    record: CloneRecord
-    is_new: bool  # False if it was complete already
-
-
-def learn(job: Job, folder: Path, threads: int | None = None) -> Learned:
+def learn(job: Job, folder: Path, threads: int | None = None) -> tuple[RunRecord, CloneRecord]:
     """Learn a policy and write its folder, unless it is complete; what was killed goes on."""
-    own = (*OWN, CLONE, _CHECKPOINT)
-    make_folder(folder, own)
+    make_folder(folder, (*OWN, CLONE, _CHECKPOINT))
     with exclusive(folder), single_thread():
-        is_new = not exists(folder / RUN)
-        if is_new:
+        if not exists(folder / RUN):
             _learn(job, folder, threads)
         run = read_run(folder)
         if differing := run.settings.differing(job.settings):
             raise InputError(
                 f"{folder} has a run with other settings: {differing}; choose another folder"
             )
-        return Learned(run, read_document(folder / CLONE, CloneRecord), is_new)
+        return run, read_document(folder / CLONE, CloneRecord)
 
 
 def _learn(job: Job, folder: Path, threads: int | None) -> None:
-    began, settings = time.monotonic(), job.settings
+    began, settings, how = time.monotonic(), job.settings, job.how
     seen = Seen(job.data, job.encoder)
+    if how.method != BC and not seen.reward_varies:
+        raise InputError(
+            f"{how.method} needs rewards that vary, and {job.data.folder} has none: jbrep data "
+            f"derive --reward gives some, or take the method {BC}"
+        )
     trained = build(settings, job.encoder, folder)._replace(statistics=seen.statistics)
-    objective = _objective(job, trained.policy)
+    if how.method == BC:
+        objective = Cloning(trained.policy, how.chunk)
+    else:
+        objective = TD3BC(trained.policy, how.alpha, job.given)
     trainer, watched = _train(job, objective, seen, folder / _CHECKPOINT)
     objective.load_state_dict(trainer.best)
     objective.eval()
     parts = _parts(objective, watched, job.data)
-    trained.policy.to("cpu")
-    note = _why_not_played(job.data)
-    history, returns = History(), None
-    if not note:
+    objective.to("cpu")
+    history, played, theirs = History(), None, job.data.episodes.get("return")
+    if not (note := _why_not_played(job.data)):
         outcome = _play(trained, threads)
         history.add(settings.steps, outcome)
-        returns = outcome.returns
-    theirs = job.data.episodes.get("return")
-    if job.data.manifest.settings.reward and not note:
-        note = "the data's rewards aren't the environment's: their returns can't be compared"
+        played = _mean(outcome.returns, trained)
+        if job.data.manifest.settings.reward:
+            note = "the data's rewards aren't the environment's: their returns can't be compared"
     record = CloneRecord(
         epochs=tuple(trainer.history),
         best_epoch=trainer.best_epoch,
         **parts,
         data=None if theirs is None else _mean(theirs, trained),
-        policy=None if returns is None else _mean(returns, trained),
+        policy=played,
         note=note,
     )
     if isinstance(job.encoder, Encoder):
@@ -249,7 +222,7 @@ def _learn(job: Job, folder: Path, threads: int | None) -> None:
         latent_size=job.encoder.latent_size,
         steps=settings.steps,
         seconds=round(time.monotonic() - began, 1),
-        versions=packages() | (environment_versions(job.data.task) if returns is not None else {}),
+        versions=packages() | (environment_versions(job.data.task) if played else {}),
         commits=commits(),
         cpu=cpu(),
         tables=write_tables(folder, history),
@@ -258,20 +231,14 @@ def _learn(job: Job, folder: Path, threads: int | None) -> None:
     (folder / _CHECKPOINT).unlink(missing_ok=True)
 
 
-def _objective(job: Job, policy: Any) -> Cloning:
-    if job.how.method == "bc":
-        return Cloning(policy, job.how.chunk)
-    return TD3BC(policy, job.how.alpha, **{name: job.setting(name) for name in _FOR_TD3})
-
-
 def _train(job: Job, objective: Cloning, seen: Seen, checkpoint: Path) -> tuple[Trainer, Windows]:
     """Train to the end; the trainer, and held-out windows."""
     settings, device = job.settings, get_device(job.settings.device)
     objective.to(device)
     count = count_windows(seen, objective.horizon)
-    size = min(job.setting("batch_size"), count)
+    size = min(job.given["batch_size"], count)
     epochs = math.ceil(settings.steps / math.ceil(count / size))
-    schedule = Schedule(epochs, size, job.setting("learning_rate"), settings.seed)
+    schedule = Schedule(epochs, size, job.given["learning_rate"], settings.seed)
     watched = watched_windows(seen, objective.horizon, device)
     windows = Windows(seen, seen.train, objective.horizon, device)
     trainer = Trainer(objective, schedule, windows, watched)
@@ -280,8 +247,7 @@ def _train(job: Job, objective: Cloning, seen: Seen, checkpoint: Path) -> tuple[
         trainer.restore(identity, checkpoint)
     saved, done = time.monotonic(), len(trainer.history)
     with Progress(total=epochs, initial=done, desc=settings.learner, unit="epoch") as progress:
-        running = trainer.epochs()
-        while not _is_over(job, trainer) and (epoch := next(running, None)):
+        for epoch in trainer.epochs(job.how.patience if job.how.method == BC else None):
             progress.set_postfix(train=f"{epoch.train_loss:.5f}", test=f"{epoch.test_loss:.5f}")
             progress.update()
             if time.monotonic() - saved > _SAVE_EVERY:
@@ -289,12 +255,6 @@ def _train(job: Job, objective: Cloning, seen: Seen, checkpoint: Path) -> tuple[
                 saved = time.monotonic()
     trainer.save(identity, checkpoint)
     return trainer, watched
-
-
-def _is_over(job: Job, trainer: Trainer) -> bool:
-    """Whether the held-out loss has not fallen for too long."""
-    since = len(trainer.history) - trainer.best_epoch
-    return job.how.method == "bc" and since >= job.how.patience
 
 
 def _parts(objective: Cloning, watched: Windows, data: Dataset) -> dict[str, Any]:

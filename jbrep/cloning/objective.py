@@ -69,16 +69,10 @@ class Cloning(Objective):
         likelihood: Tensor = self.policy.get_distribution(seen).log_prob(actions)
         return -likelihood.mean()
 
-    def chosen(self, seen: Tensor) -> Tensor:
-        """The policy's most likely actions, (n, chunk * k)."""
-        actions: Tensor = self.policy._predict(seen, deterministic=True)
-        return actions.clamp(-1, 1)
-
     def errors(self, windows: Windows) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """The errors of actions in windows, and the actions, scaled to [-1, 1], (n, chunk, k)."""
-        numbers = windows.numbers
+        actions = windows.actions(windows.numbers, self.horizon + 1)
         with torch.no_grad():
-            parts = [self.chosen(windows.rows(some)) for some in numbers.split(8192)]
-        actions = windows.actions(numbers, self.horizon + 1)
-        errors = torch.cat(parts).view_as(actions) - actions
+            chosen = self.policy._predict(windows.rows(windows.numbers), deterministic=True)
+        errors = chosen.clamp(-1, 1).view_as(actions) - actions
         return errors.numpy(force=True), actions.numpy(force=True)

@@ -3,7 +3,7 @@
 Fujimoto and Gu, A minimalist approach to offline reinforcement learning, 2021.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -29,26 +29,15 @@ class TD3BC(Cloning):
     Args:
         policy: of stable-baselines3's TD3.
         alpha: weight of the value.
-        gamma, tau, policy_delay, target_policy_noise, target_noise_clip: as TD3 has them.
+        td3: gamma, tau, policy_delay, target_policy_noise, target_noise_clip, as TD3 has them.
     """
 
     kept_by = None
     _updates: Tensor
 
-    def __init__(
-        self,
-        policy: Any,
-        alpha: float,
-        *,
-        gamma: float,
-        tau: float,
-        policy_delay: int,
-        target_policy_noise: float,
-        target_noise_clip: float,
-    ):
+    def __init__(self, policy: Any, alpha: float, td3: Mapping[str, Any]):
         super().__init__(policy, chunk=1)
-        self._alpha, self._gamma, self._tau, self._delay = alpha, gamma, tau, policy_delay
-        self._noise, self._clip = target_policy_noise, target_noise_clip
+        self._alpha, self._td3 = alpha, td3
         self.register_buffer("_updates", torch.zeros((), dtype=torch.int64))
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
@@ -59,10 +48,11 @@ class TD3BC(Cloning):
     def draws(
         self, windows: Windows, numbers: Tensor, size: int, generator: torch.Generator
     ) -> Iterator[Any]:
+        clip = self._td3["target_noise_clip"]
         for batch in super().draws(windows, numbers, size, generator):
             actions = batch[1]
             noise = torch.randn(actions.shape, generator=generator, device=actions.device)
-            yield *batch, (self._noise * noise).clamp(-self._clip, self._clip)
+            yield *batch, (self._td3["target_policy_noise"] * noise).clamp(-clip, clip)
 
     def gradient(self, batch: Any) -> Tensor:
         """Set the gradients of the critics and, every `policy_delay` times, of the actor.
@@ -70,8 +60,8 @@ class TD3BC(Cloning):
         The targets follow first what the optimiser has made of the last ones. Parameters without a
         gradient stay as they are. The loss that is returned is the critics'.
         """
-        number, policy = int(self._updates), self.policy
-        if number and (number - 1) % self._delay == 0:
+        number, policy, delay = int(self._updates), self.policy, self._td3["policy_delay"]
+        if number and (number - 1) % delay == 0:
             self._follow(policy.critic, policy.critic_target)
             self._follow(policy.actor, policy.actor_target)
         self._updates += 1
@@ -79,11 +69,11 @@ class TD3BC(Cloning):
         with torch.no_grad():
             following = (policy.actor_target(after) + noise).clamp(-1, 1)
             value = torch.cat(policy.critic_target(after, following), 1).amin(1, keepdim=True)
-            target = rewards + self._gamma * (1 - terminated) * value
+            target = rewards + self._td3["gamma"] * (1 - terminated) * value
         loss = sum((each - target).square().mean() for each in policy.critic(seen, actions))
         _set_gradients(policy.parameters(), None)
         _set_gradients(policy.critic.parameters(), loss)
-        if number % self._delay == 0:
+        if number % delay == 0:
             chosen = policy.actor(seen)
             values = policy.critic.q1_forward(seen, chosen)
             gain = self._alpha * values.mean() / values.detach().abs().mean().clamp(min=1e-8)
@@ -92,9 +82,8 @@ class TD3BC(Cloning):
 
     def _follow(self, network: nn.Module, target: nn.Module) -> None:
         with torch.no_grad():
-            pairs = zip(network.parameters(), target.parameters(), strict=True)
-            for own, its in pairs:
-                its.lerp_(own, self._tau)
+            for own, its in zip(network.parameters(), target.parameters(), strict=True):
+                its.lerp_(own, self._td3["tau"])
 
     def rate(self, progress: float, step: int) -> float:
         return 1.0

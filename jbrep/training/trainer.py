@@ -111,10 +111,12 @@ class Trainer:
         losses = [getattr(epoch, kept_by) for epoch in self.history]
         return losses.index(min(losses)) + 1
 
-    def epochs(self) -> Iterator[Epoch]:
-        """Train to the end, yielding each epoch."""
+    def epochs(self, patience: int | None = None) -> Iterator[Epoch]:
+        """Train to the end, yielding each epoch; or until so many were no better than the best."""
         with single_torch_thread():
             while len(self.history) < self.schedule.epochs:
+                if patience and len(self.history) - self.best_epoch >= patience:
+                    return
                 self._epoch()
                 yield self.history[-1]
 

@@ -78,13 +78,13 @@ class Windows:
         return self.rows(numbers), self.actions(numbers)[:, 0], self.rows(numbers, 1)
 
     def after(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """The row after each window's first, (n, size), which may be the end of the episode.
+        """What follows each window's first row, (n, size), also at the end of its episode.
 
-        And whether a state ended the episode there, (n,).
+        And whether a state ended the episode there, 1 or 0, (n,).
         """
-        rows, places, ended = self._following
-        following = places.index_select(0, self._first(numbers))
-        return rows.index_select(0, following), ended.index_select(0, following)
+        rows, ended = self._following
+        first = self._first(numbers)
+        return rows.index_select(0, first), ended.index_select(0, first)
 
     @property
     def first_rows(self) -> NDArray[np.int64]:
@@ -102,24 +102,14 @@ class Windows:
         return torch.from_numpy(self._data.load(self._rows)).to(self.device)
 
     @cached_property
-    def _following(self) -> tuple[Tensor, Tensor, Tensor]:
-        """All rows with those at the ends of episodes behind them, (rows + episodes, size).
-
-        Of each row the place there of the next one, (rows,); of each place, whether a state ended
-        its episode there, (rows + episodes,).
-        """
-        episodes, count = self._data.dataset.episodes, len(self._rows)
+    def _following(self) -> tuple[Tensor, Tensor]:
+        episodes, rows = self._data.dataset.episodes, self._scaled.roll(-1, 0)
         lasts = np.cumsum(episodes["length"], dtype=np.int64) - 1
-        own = np.isin(lasts, self._rows)
-        places = np.arange(1, count + 1)
-        places[np.searchsorted(self._rows, lasts[own])] = count + np.arange(own.sum())
-        finals = torch.from_numpy(self._data.scale(episodes["final_observation"][own]))
-        ended = np.concatenate((np.zeros(count), episodes["terminated"][own]))
-        return (
-            torch.cat((self._scaled, finals.to(self.device))),
-            torch.from_numpy(places).to(self.device),
-            torch.from_numpy(ended.astype(np.float32)).to(self.device),
-        )
+        own, ended = np.isin(lasts, self._rows), np.zeros(len(rows), np.float32)
+        places = np.searchsorted(self._rows, lasts[own])
+        finals = self._data.scale(episodes["final_observation"][own])
+        rows[places], ended[places] = torch.from_numpy(finals).to(rows), episodes["terminated"][own]
+        return rows, torch.from_numpy(ended).to(self.device)
 
     @cached_property
     def _action(self) -> Tensor:
