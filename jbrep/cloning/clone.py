@@ -27,16 +27,7 @@ from jbrep.records.commit import commits
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Finite, to_plain
 from jbrep.records.storage import exclusive, exists, make_folder, write_whole
-from jbrep.rl.files import (
-    ENCODER,
-    EVALUATION_SEED,
-    FINISHED,
-    OWN,
-    POLICY,
-    RUN,
-    RunRecord,
-    read_run,
-)
+from jbrep.rl.files import ENCODER, EVALUATION_SEED, FINISHED, OWN, POLICY, RUN, RunRecord, read_run
 from jbrep.rl.history import History
 from jbrep.rl.learner import Learner, usual_name
 from jbrep.rl.policy import Trained, build, pack_whole
