@@ -97,9 +97,9 @@ class CloneRecord(Document, frozen=True, kw_only=True):
         rows = [(each.name, number(each.mse, ".4f"), r2_text(each.r2)) for each in parts]
         kept = f"epoch {self.best_epoch} of {len(self.epochs)} is kept; held-out actions:"
         lines = [kept, Table("", ("", "error", "R²"), rows).text(width)]
-        lines += [f"returns: policy {self.policy}"] if self.policy else []
-        lines += [f"returns: data {self.data}"] if self.data else []
-        return "\n".join(lines)
+        means = (("policy", self.policy), ("data", self.data))
+        told = "; ".join(f"{name} {mean}" for name, mean in means if mean)
+        return "\n".join(lines + ([f"mean return [95 %]: {told}"] if told else []))
 
 
 class Job(NamedTuple):
