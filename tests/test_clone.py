@@ -137,7 +137,7 @@ def test_one_that_was_killed_ends_with_the_same_bytes(home, log, cloned, monkeyp
     assert_same_files(home / "bc", home / "killed", *FILES)
     assert not (home / "killed/training.safetensors").exists()
     jbrep.clone(log, home / "killed", **QUICK)  # nothing to do
-    with pytest.raises(InputError, match="cloned.chunk 1"):
+    with pytest.raises(InputError, match=r"cloned\.chunk 1"):
         jbrep.clone(log, home / "killed", chunk=2, **QUICK)
 
 

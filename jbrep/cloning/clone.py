@@ -45,8 +45,7 @@ CLONE = "clone.json"
 _CHECKPOINT = "training.safetensors"  # until the training has ended
 _SAVE_EVERY = 10.0  # seconds between checkpoints, at least
 _STEPS = {BC: 20_000, "td3+bc": 100_000}  # gradient steps where nothing is said
-_AT_ONCE = 10  # episodes that are played
-_TIMES = 10  # parts of the longest episode
+_AT_ONCE, _TIMES = 10, 10  # episodes that are played; parts of the longest episode
 _FOR_NETWORK, _FOR_ALL = ("net_arch", "activation_fn"), ("learning_rate", "batch_size")
 _FOR_TD3 = ("gamma", "tau", "policy_delay", "target_policy_noise", "target_noise_clip")
 _BASES: dict[str, tuple[str, dict[str, Any]]] = {  # whose policy it is, by the loss
@@ -177,9 +176,8 @@ def _learn(job: Job, folder: Path, threads: int | None) -> None:
             f"derive --reward gives some, or take the method {BC}"
         )
     trained = build(settings, job.encoder, folder)._replace(statistics=seen.statistics)
-    if how.method == BC:
-        objective = Cloning(trained.policy, how.chunk)
-    else:
+    objective = Cloning(trained.policy, how.chunk)
+    if how.method != BC:
         objective = TD3BC(trained.policy, how.alpha, job.given)
     trainer, watched = _train(job, objective, seen, folder / _CHECKPOINT)
     objective.load_state_dict(trainer.best)
@@ -283,9 +281,11 @@ def _why_not_played(data: Dataset) -> str:
     try:
         spec_of(data.task)
     except (InputError, ModuleNotFoundError) as error:
-        if data.manifest.settings.is_imported:
-            return f"{data.folder} names no environment"
-        return f"its environment isn't here ({error})"
+        named = "names no environment" if data.manifest.settings.is_imported else f"needs: {error}"
+        return (
+            f"{data.folder} {named}, so the policy wasn't played: a low error doesn't say what it "
+            "returns, as errors lead to states that aren't in the data, and to larger errors"
+        )
     return ""
 
 
