@@ -395,9 +395,8 @@ def clone(
         check_found(str(encoder), known.task)
     from jbrep.cloning.clone import Job, learn  # imports torch
 
-    of_run = {"seed": seed, "final_episodes": episodes, "device": device}
-    job = Job.of(known, encoder, how, overrides, steps, **of_run)
-    run, record = learn(job, Path(out), threads)
+    of_run = {"steps": steps, "seed": seed, "final_episodes": episodes, "device": device}
+    run, record = learn(Job.of(known, encoder, how, overrides, **of_run), Path(out), threads)
     if record.note:
         _note(record.note)
     return Agent(Path(out), run, None if isinstance(encoder, str | Path) else encoder, record)

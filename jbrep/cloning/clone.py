@@ -117,7 +117,6 @@ class Job(NamedTuple):
         encoder: Any,
         how: CloneSettings,
         overrides: Mapping[str, Any],
-        steps: int | None,
         **of_run: Any,
     ) -> "Job":
         """A policy to learn from data, as `jbrep.clone` describes it; `of_run` are a run's fields.
@@ -139,8 +138,7 @@ class Job(NamedTuple):
             preset=MODERN,
             overrides={**usual, **overrides, "normalize": True},
         )
-        steps = steps or _STEPS[how.method]
-        of_run |= {"steps": steps, "evaluate_every": steps}
+        of_run["steps"] = of_run["evaluate_every"] = of_run["steps"] or _STEPS[how.method]
         of_run["evaluation_episodes"] = min(_AT_ONCE, of_run["final_episodes"])
         run = Run(task=data.task, learner=learner, encoder=encoder, **of_run)
         found, chosen = run.find_encoder(), learner.hyperparameters
@@ -161,9 +159,7 @@ def learn(job: Job, folder: Path, threads: int | None = None) -> tuple[RunRecord
             _learn(job, folder, threads)
         run = read_run(folder)
         if differing := run.settings.differing(job.settings):
-            raise InputError(
-                f"{folder} has a run with other settings: {differing}; choose another folder"
-            )
+            raise InputError(f"{folder} has another run: {differing}; choose another folder")
         return run, read_document(folder / CLONE, CloneRecord)
 
 
@@ -186,7 +182,7 @@ def _learn(job: Job, folder: Path, threads: int | None) -> None:
     objective.to("cpu")
     history, played, theirs = History(), None, job.data.episodes.get("return")
     if not (note := _why_not_played(job.data)):
-        outcome = _play(trained, threads)
+        outcome = _play(trained, settings, threads)
         history.add(settings.steps, outcome)
         played = _mean(outcome.returns, trained)
         if job.data.manifest.settings.reward:
@@ -265,10 +261,8 @@ def _parts(objective: Cloning, watched: Windows, data: Dataset) -> dict[str, Any
     }
 
 
-def _play(trained: Trained, threads: int | None) -> Outcome:
+def _play(trained: Trained, settings: RunSettings, threads: int | None) -> Outcome:
     """What comes of the episodes that every run is evaluated on."""
-    settings = trained.settings
-    assert settings is not None
     count = settings.final_episodes
     with lanes_at_once(trained.task, settings.evaluation_episodes, threads, 0) as lanes:
         seeds = range(EVALUATION_SEED, EVALUATION_SEED + count, lanes.num_lanes)

@@ -22,9 +22,10 @@ class TD3BC(Cloning):
         the critics' loss: (Q1(s, a) - y)^2 + (Q2(s, a) - y)^2
         the actor's, every `policy_delay` steps: |pi(s) - a|^2 - alpha Q1(s, pi(s)) / mean |Q1|
 
-    An episode that was cut, not terminated by a state, goes on in the value of its last state. The
-    loss that is watched is the squared error of the held-out actions, which isn't what is
-    minimised: the last epoch is kept.
+    An episode that was cut, not terminated by a state, goes on in the value of its last state.
+    Where none is terminated, rewards are taken less their mean: that shifts all values alike, and
+    mean |Q1| then is how far they differ. The loss that is watched is the squared error of held-out
+    actions, which isn't what is minimised: the last epoch is kept.
 
     Args:
         policy: of stable-baselines3's TD3.
@@ -39,10 +40,15 @@ class TD3BC(Cloning):
         super().__init__(policy, chunk=1)
         self._alpha, self._td3 = alpha, td3
         self.register_buffer("_updates", torch.zeros((), dtype=torch.int64))
+        self._shift = 0.0
+
+    def prepare(self, windows: Windows) -> None:
+        if not windows.after(windows.numbers)[1].any():
+            self._shift = float(windows.rewards(windows.numbers).mean())
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
         after, terminated = windows.after(numbers)
-        rewards = windows.rewards(numbers)[:, None]
+        rewards = windows.rewards(numbers)[:, None] - self._shift
         return *super().batch(windows, numbers), rewards, after, terminated[:, None]
 
     def draws(
