@@ -18,6 +18,7 @@ from jbrep.lazy import exports
 
 if TYPE_CHECKING:
     from jbrep.api import check as check
+    from jbrep.api import clone as clone
     from jbrep.api import collect as collect
     from jbrep.api import evaluate as evaluate
     from jbrep.api import evaluate_policy as evaluate_policy

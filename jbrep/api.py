@@ -35,13 +35,15 @@ from jbrep.parameters import (
     Workers,
     find_study,
 )
-from jbrep.rl.settings import Seed, TrainingSettings
+from jbrep.rl.settings import CloneSettings, Episodes, Seed, TrainingSettings
+from jbrep.rl.settings import Steps as TrainingSteps
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from jbrep.checking.check import Check
+    from jbrep.cloning.clone import CloneRecord
     from jbrep.dataset import Dataset
     from jbrep.encoders import Encoder
     from jbrep.envs.task import Task
@@ -61,15 +63,17 @@ class Agent(NamedTuple):
         folder: of the run.
         record: what run.json says: settings, status, seconds.
         encoder: of the agent, if it is a user's own object.
+        clone: if it was learned from data: held-out errors, and the returns of data and policy.
     """
 
     folder: Path
     record: "RunRecord"
     encoder: Any = None
+    clone: "CloneRecord | None" = None
 
     @property
     def returns(self) -> "NDArray[np.float64]":
-        """Returns of the final evaluation, one of each episode."""
+        """Returns of the final evaluation, one of each episode; none without an environment."""
         import numpy as np
 
         from jbrep.rl.files import last_returns, read_evaluations
@@ -91,9 +95,10 @@ class Agent(NamedTuple):
         what = f"{settings.learner} on {settings.representation}, {settings.task}"
         if self.record.status != FINISHED:
             return f"Agent({what}: {self.record.reason})"
-        return (
-            f"Agent({what}: {mean_text(settings.environment, self.returns)}; {str(self.folder)!r})"
-        )
+        told = "not played"
+        if len(self.returns):
+            told = mean_text(settings.environment, self.returns)
+        return f"Agent({what}: {told}; {str(self.folder)!r})"
 
 
 class Judged(NamedTuple):
@@ -423,6 +428,54 @@ def train(
         )
         record = train_run(run, folder, session, found)
     return Agent(folder, record, None if isinstance(encoder, str | Path) else encoder)
+
+
+def clone(
+    data: "Dataset | str | Path",
+    out: str | Path,
+    *,
+    encoder: Seen = "full",
+    seed: Seed = 0,
+    steps: TrainingSteps | None = None,
+    overrides: Overrides = NOTHING,
+    episodes: Episodes = 50,
+    threads: Threads = None,
+    device: str = "cpu",
+    **settings: Annotated[Any, CloneSettings],
+) -> Agent:
+    """Learn a policy from a data set alone: clone the one that acted, or improve on it.
+
+    What is learned from 80 % of the episodes is judged on the others, by its actions. Cloning keeps
+    the epoch with the least held-out loss. Where the data's environment is here, the policy plays
+    it, beside the data's own returns. The result is a run's folder, for every command that takes a
+    policy. The same again resumes a training that was stopped.
+
+    Args:
+        data: a folder from jbrep collect or jbrep data import.
+        out: a folder for this policy.
+        seed: of the initial weights and the order of the data.
+        steps: of the gradient, at most, in whole epochs; by default 20,000, of TD3+BC 100,000.
+        overrides: a setting of the network or its training, such as net_arch=[64,64],
+            learning_rate=1e-3 or batch_size=512; of TD3+BC gamma, tau, policy_delay, ..., too; may
+            be repeated.
+        episodes: that it plays, those that every run is evaluated on.
+        device: where: cpu, cuda, or auto.
+        settings: method, loss, chunk, patience, alpha.
+    """
+    from jbrep.dataset import Dataset
+    from jbrep.encoders.shipped import check_found
+
+    how = CloneSettings(**settings)
+    known = data if isinstance(data, Dataset) else Dataset(data)
+    if isinstance(encoder, str | Path):
+        check_found(str(encoder), known.task)
+    from jbrep.cloning.clone import Job, learn  # imports torch
+
+    of_run = {"steps": steps, "seed": seed, "final_episodes": episodes, "device": device}
+    run, record = learn(Job.of(known, encoder, how, overrides, **of_run), Path(out), threads)
+    if record.note:
+        _note(record.note)
+    return Agent(Path(out), run, None if isinstance(encoder, str | Path) else encoder, record)
 
 
 def check_learner(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from msgspec import Meta
 
 from jbrep.errors import STEP_TIMEOUT, InputError
+from jbrep.records.storage import exists
 from jbrep.rl.presets import ALGORITHMS
 
 if TYPE_CHECKING:
@@ -141,10 +142,21 @@ def described(
         if env or episode_steps or features or missing or hide or history > 1 or action_bounds:
             raise InputError("give the `task`: one of the Jitterbug's, or a Gymnasium id")
         return None
+    from jbrep.dataset.manifest import MANIFEST
     from jbrep.envs.description import describe
-    from jbrep.envs.names import name_given
+    from jbrep.envs.names import find_spec, name_given
 
     named = name_given(task)
+    try:
+        find_spec(named)
+    except InputError:
+        for folder in (Path(task), Path("data", task)):
+            if exists(folder / MANIFEST):
+                raise InputError(
+                    f"{task} is a data set, not a task: jbrep clone --data {folder} learns a "
+                    "policy from it alone"
+                ) from None
+        raise
     said = env, episode_steps, features, missing, hide, history
     return describe(named, *said, action_bounds=action_bounds)
 

@@ -20,6 +20,8 @@ LESS = {  # by command: numbers in place of a page's, or beside them
     "train-dae": {"--epochs": "2"},
     "train-encoder": {},
     "rl": {"--steps": "200", "--evaluation-episodes": "1", "--episode-steps": "100"},
+    "clone": {"--steps": "50", "--episodes": "2"},
+    "tune": {"--steps": "1100", "--trials": "1", "--evaluation-episodes": "1"},
     "render": {"--seconds": "0.5", "--size": "64x64"},
     "evaluate-policy": {"--episodes": "2"},
 }

@@ -29,7 +29,7 @@ def record(model: str, out: str, episodes: int = 100, steps: int = 1000) -> list
     arguments = said["environment"].get("arguments", {})
     task = jbrep.describe(said["task"], arguments)
     period, repeat = said["control_period"], said["action_repeat"]
-    if not period or said["history"] > 1:
+    if not period or said["history"] > 1 or said["chunk"] > 1:
         raise SystemExit(f"{model} must act on single states, in steps of a known time")
     offset = np.array([each["offset"] for each in said["observation"]])
     sensors = [f"{each['name']} [{each['unit']}]" for each in said["observation"]]

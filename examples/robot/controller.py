@@ -39,14 +39,14 @@ class Controller:
         )
         room = FAR * (high - low)
         self._low, self._high = low - room, high + room  # NaN where no range is known
-        self.size, self.repeat = len(low), said["action_repeat"]
+        self.size, self.repeat, self.chunk = len(low), said["action_repeat"], said["chunk"]
         self._states: deque[np.ndarray] = deque(maxlen=said["history"])  # the newest first
         self._actions: deque[np.ndarray] = deque(maxlen=said["history"] - 1)
         self.period = said["control_period"] or 0.01
         bounds = np.array([said["action"]["low"], said["action"]["high"]], np.float32)
         self.safe = np.clip(np.zeros_like(bounds[0]), *bounds)  # no torque
         self.seconds: list[float] = []  # that each action took
-        self._action, self._chosen = self.safe, -1  # the newest, and its step // repeat
+        self._action, self._chosen = self.safe, -1  # the newest, and the chunk it is of
 
     def act(self, step: int, sensors: np.ndarray) -> np.ndarray | None:
         """The action at a control step; None, for the safe one, if sensors can't be believed.
@@ -65,13 +65,15 @@ class Controller:
             self._states.extend([sensors] * (self._states.maxlen or 1))
             self._actions.extend([self.safe] * (self._actions.maxlen or 0))
         self._states.appendleft(sensors)
-        if step // self.repeat != self._chosen:
-            self._chosen = step // self.repeat
+        number = step // self.repeat
+        if number // self.chunk != self._chosen:
+            self._chosen = number // self.chunk
             began = time.perf_counter()
             seen = np.concatenate([*self._states, *self._actions])[None]
             (actions,) = self._session.run(["action"], {"observation": seen})
             self.seconds.append(time.perf_counter() - began)
-            self._action = actions[0]
+            self._ahead = actions[0].reshape(self.chunk, -1)
+        self._action = self._ahead[number % self.chunk]
         self._actions.appendleft(self._action)
         return self._action
 

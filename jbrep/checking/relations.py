@@ -13,7 +13,7 @@ from jbrep.dataset.scaled import sample
 from jbrep.envs.task import Array
 from jbrep.evaluation.evaluation import Score
 from jbrep.evaluation.held_out import explained
-from jbrep.evaluation.regression import Predictor, Problem, fit, ridge
+from jbrep.evaluation.regression import Predictor, Problem, fit
 from jbrep.stats.bootstrap import by_episode
 from jbrep.text import counted
 
@@ -115,8 +115,12 @@ class Relations:
 
     def _fit(self, *problems: tuple[Array, Array]) -> list[Predictor]:
         """Ridge regressions, and networks of what these leave, of the rows to fit."""
+        from sklearn.linear_model import Ridge  # not at the top: it takes seconds
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
+
         rows = [(given[self._train], wanted[self._train]) for given, wanted in problems]
-        lines = [ridge(*each) for each in rows]
+        lines = [make_pipeline(StandardScaler(), Ridge()).fit(x, y).predict for x, y in rows]
         left = [Problem(x, y - line(x)) for (x, y), line in zip(rows, lines, strict=True)]
         return [
             lambda x, line=line, rest=rest: line(x) + rest(x)  # type: ignore[misc]

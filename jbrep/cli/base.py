@@ -22,9 +22,9 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 RESUMES = "the same command resumes it"
 _ORDER = (  # of work
-    *("env", "check", "collect", "data", "train-dae", "train-encoder", "evaluate", "encoder", "rl"),
-    *("policies", "policy", "evaluate-policy", "study", "report"),
-    *("inspect", "render", "doctor"),
+    *("env", "check", "collect", "data", "train-dae", "train-encoder", "evaluate", "encoder"),
+    *("rl", "clone", "policies", "policy", "evaluate-policy"),
+    *("study", "report", "inspect", "render", "doctor"),
 )
 _GROUPS = {
     "data": "Inspect, repair, derive, import and export data sets.",

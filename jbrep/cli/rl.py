@@ -10,6 +10,7 @@ from jbrep.cli.base import RESUMES, command, say, tell
 from jbrep.cli.signals import stop_signals, stoppable
 from jbrep.errors import StoppedError
 from jbrep.parameters import DrawnTask
+from jbrep.text import terminal_width
 
 
 @command("rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a")
@@ -41,6 +42,14 @@ def _rl(
     tell(f"encoder: {source_of(options.get('encoder', 'full'), task)}; all evaluations:")
     say(str(out / EVALUATIONS))
     return False
+
+
+@command("clone --data data/walk --encoder encoders/pca-2.safetensors --out runs/clone")
+def _clone(out: Path, **options: Annotated[Any, api.clone]) -> None:
+    with stoppable(RESUMES):
+        agent = api.clone(out=out, **options)
+    assert agent.clone
+    say(f"{agent.record.settings.name}: {agent.clone.card(terminal_width())}\n{out}")
 
 
 @contextmanager

@@ -16,10 +16,16 @@ from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 
 
-def agent_spaces(task: Task, encoder: BaseEncoder | None) -> tuple[spaces.Box, spaces.Box]:
-    """The spaces of what an agent observes and of its actions, which are scaled to [-1, 1]."""
+def agent_spaces(
+    task: Task, encoder: BaseEncoder | None, chunk: int = 1
+) -> tuple[spaces.Box, spaces.Box]:
+    """The spaces of what an agent observes and of the actions that it chooses at once.
+
+    Actions are scaled to [-1, 1].
+    """
     size = encoder.latent_size if encoder else task.size
-    return spaces.Box(-np.inf, np.inf, (size,), np.float32), spaces.Box(-1, 1, (task.action_size,))
+    acts = spaces.Box(-1, 1, (chunk * task.action_size,))
+    return spaces.Box(-np.inf, np.inf, (size,), np.float32), acts
 
 
 class JitterbugVecEnv(VecEnv):

@@ -35,19 +35,22 @@ def play(lanes: Lanes, act: Actor) -> Iterator[Played]:
         yield Played(observation, action, active, lanes.step(action))
 
 
-def held(act: Callable[[_Seen], NDArray[Any]], repeat: int) -> Callable[[_Seen], NDArray[Any]]:
-    """The actor that lets another choose an action and holds it for so many steps in all lanes.
+def held(
+    act: Callable[[_Seen], NDArray[Any]], repeat: int, chunk: int = 1
+) -> Callable[[_Seen], NDArray[Any]]:
+    """The actor that lets another choose actions and holds each for so many steps in all lanes.
 
+    It chooses `chunk` of them at once, (..., chunk * k), which are played one after the other.
     Lanes must be at the start of their episodes when it first acts.
     """
-    left, chosen = 0, np.empty(0)  # steps for which the action is still held
+    upcoming: list[NDArray[Any]] = []
 
     def choose_or_hold(observation: _Seen) -> NDArray[Any]:
-        nonlocal left, chosen
-        if not left:
-            chosen, left = act(observation), repeat
-        left -= 1
-        return chosen
+        nonlocal upcoming
+        if not upcoming:
+            chosen = np.split(act(observation), chunk, axis=-1)
+            upcoming = [each for each in chosen for _ in range(repeat)]
+        return upcoming.pop(0)
 
     return choose_or_hold
 

@@ -152,7 +152,7 @@ class SelfPredictionObjective(Objective):
     """
 
     horizon = 1
-    moving_target = True
+    kept_by = None
 
     def __init__(self, method: SelfPrediction, data: ScaledDataset):
         super().__init__()

@@ -235,6 +235,7 @@ class Described(msgspec.Struct):
 
     environment: Task
     action_repeat: Annotated[int, Meta(ge=1)]
+    chunk: Annotated[int, Meta(ge=1)] = 1
 
 
 def read_exported(path: Path) -> tuple[Any, Described]:
@@ -273,7 +274,7 @@ def _exported(path: Path, task: Task | None) -> Player:
         raise InputError(f"{path} isn't a policy that jbrep policy export wrote")
     (given,), (made,) = ends
     sizes = given.shape[1], made.shape[1]
-    if sizes != (known.size, known.action_size):
+    if sizes != (known.size, said.chunk * known.action_size):
         raise InputError(
             f"{path} takes {sizes[0]} numbers and gives {sizes[1]}, but {known.name} observes "
             f"{known.size} and acts by {known.action_size}: give its --task"
@@ -285,6 +286,6 @@ def _exported(path: Path, task: Task | None) -> Player:
         return action
 
     def begin(task: Task, seeds: Any) -> Actor:
-        return held(act, said.action_repeat)
+        return held(act, said.action_repeat, said.chunk)
 
     return Player(str(path), known, begin)

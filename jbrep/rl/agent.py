@@ -235,7 +235,8 @@ def deterministic_actor(
 
     They are not finite where its weights aren't. A policy whose own actions are in [-1, 1] has them
     scaled to the task's bounds. What it sees of observations (n, d) is preprocessed. A network
-    rounds differently in batches of other sizes; all rows are one if no size is given.
+    rounds differently in batches of other sizes; all rows are one if no size is given. Several
+    actions that are chosen at once stand in one row.
     """
     policy.set_training_mode(False)
     low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
@@ -250,7 +251,8 @@ def deterministic_actor(
             ]
         actions = torch.cat(chosen).numpy(force=True)
         own = policy.unscale_action(actions) if policy.squash_output else actions
-        return np.clip(task.unscale_action(own).astype(np.float32), low, high)
+        own = task.unscale_action(own.reshape(-1, task.action_size)).astype(np.float32)
+        return np.clip(own, low, high).reshape(actions.shape)
 
     return act
 

@@ -45,7 +45,7 @@ class Acting(NamedTuple):
     statistics: tuple[Any, Any] | None
     # layers to the actions before they are squashed or clipped to [-1, 1]
     network: tuple[Layer, ...]
-    # low, high: bounds of the actions, (k,), to which they are scaled then
+    # low, high: bounds of the actions, (k,), to which they are scaled then; of each of a chunk
     low: Any
     high: Any
     is_squashed: bool  # whether actions are squashed; others are clipped
@@ -109,8 +109,8 @@ class Controller:
         self.acting = Acting(
             statistics=statistics.arrays if statistics else None,
             network=network_of(settings, encoder.latent_size, weights),
-            low=np.array(self.task.action_low, np.float32),
-            high=np.array(self.task.action_high, np.float32),
+            low=np.tile(np.array(self.task.action_low, np.float32), settings.chunk),
+            high=np.tile(np.array(self.task.action_high, np.float32), settings.chunk),
             is_squashed=ALGORITHMS[settings.algorithm].learns_off_policy,
         )
         view = self.task.view
@@ -126,9 +126,10 @@ class Controller:
     def reset(self) -> None:
         """Begin another episode, of any number of robots: the next call chooses an action."""
         self._given: NDArray[np.float32] | None = None  # the last observation, with what stood in
-        self._held: NDArray[Any] = np.empty(0)  # the action since then
+        self._chunk: NDArray[Any] = np.empty(0)  # the actions that were chosen at once
+        self._held: NDArray[Any] = np.empty(0)  # the one of them since then
         self._missed: NDArray[np.int64] = np.zeros(1, np.int64)  # steps in a row, of each robot
-        self._first = self._step = self._turn = 0
+        self._first = self._step = self._choice = 0
         self._window: Window | None = None
 
     def __call__(
@@ -163,11 +164,12 @@ class Controller:
         if self._given is not None:
             rows = np.where(lacking, np.atleast_2d(self._given), rows)
         seen = self._with_history(rows, left_out).reshape(*given.shape[:-1], -1)
-        turn = (now - first) // self.action_repeat
-        if begins or turn != self._turn:
-            self._held = self._chosen(seen)
+        choice, part = divmod((now - first) // self.action_repeat, self.settings.chunk)
+        if begins or choice != self._choice:
+            self._chunk = self._chosen(seen)
+        self._held = np.split(self._chunk, self.settings.chunk, axis=-1)[part]
         self._given, self._missed = rows.reshape(given.shape), missed
-        self._first, self._step, self._turn = first, now, turn
+        self._first, self._step, self._choice = first, now, choice
         return self._held.reshape(*given.shape[:-1], -1).copy()
 
     def _with_history(self, rows: NDArray[np.float32], left_out: int) -> NDArray[np.float32]:
@@ -293,7 +295,9 @@ def export(controller: Controller, path: Path, form: str = "onnx") -> None:
     Its input is `observation`, (rows, d) float32 in the units of the task's features; its output is
     `action`, (rows, k) in those of the actuators. `described` is in its metadata, as `jbrep`. Each
     action is to be held for `action_repeat` control steps, which is for the caller to do, as is
-    keeping the states and actions of the steps before for a policy that was trained with a history.
+    keeping the states and actions of the steps before for a policy that was trained with a history,
+    and playing the actions of a `chunk`, which stand one after the other in `action`, (rows, chunk
+    * k).
 
     Args:
         controller: of the policy.
@@ -334,6 +338,7 @@ def described(controller: Controller) -> dict[str, Any]:
         "history": task.view.history if task.view else 1,
         "control_period": task.timestep,  # seconds
         "action_repeat": controller.action_repeat,
+        "chunk": settings.chunk,  # actions that are chosen at once
         "rate": None if period is None else 1 / period,  # actions a second
         "encoder": {"name": controller.encoder.name, "sha256": controller.encoder.fingerprint},
         "learner": settings.learner,

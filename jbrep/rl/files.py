@@ -139,7 +139,7 @@ def last_infos(infos: Sequence[Info], evaluations: Sequence[Evaluation]) -> dict
 
 
 def last_returns(evaluations: Sequence[Evaluation]) -> list[float]:
-    """The returns of the last evaluation."""
+    """The returns of the last evaluation; none of a policy that was never played."""
     return [row.episode_return for row in evaluations if row.step == evaluations[-1].step]
 
 

@@ -92,7 +92,7 @@ class Trained(NamedTuple):
         return self._held(deterministic_actor(self.policy, self.task, preprocess, batch_size=1))
 
     def _held(self, act: Actor) -> Actor:
-        return held(_finite(act), self.action_repeat)
+        return held(_finite(act), self.action_repeat, self.settings.chunk if self.settings else 1)
 
     def with_weights(self, weights: Tensors, tensors: Tensors, source: Path) -> "Trained":
         """The policy with weights of the part that acts, and statistics among tensors."""
@@ -137,7 +137,7 @@ def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
     what = "no policy can be made from the settings of the run"
     errors = (AssertionError, KeyError, TypeError, ValueError)
     with refusing(what, errors, told=one_line), global_random_state_kept():
-        spaces = Spaces(*agent_spaces(task, encoder))
+        spaces = Spaces(*agent_spaces(task, encoder, settings.chunk))
         agent = make_agent(settings.algorithm, small, spaces, settings.seed)
     statistics = Statistics.untrained(encoder.latent_size) if shape.normalize else None
     repeat = settings.hyperparameters.action_repeat
@@ -284,7 +284,7 @@ def _sizes(settings: RunSettings, latent_size: int) -> dict[str, Any]:
         "normalize": shape.normalize,
         "features": settings.environment.size,
         "latent": latent_size,
-        "actions": settings.environment.action_size,
+        "actions": settings.environment.action_size * settings.chunk,
     }
 
 

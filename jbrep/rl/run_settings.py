@@ -11,6 +11,7 @@ from jbrep.errors import differences
 from jbrep.records.record import Sha256, pattern, to_plain
 from jbrep.rl.presets import ALGORITHMS, LINEAR, Hyperparameters, learns_from
 from jbrep.rl.settings import (
+    CloneSettings,
     Episodes,
     LearnerName,
     Line,
@@ -47,6 +48,12 @@ class SharedSettings(TrainingSettings, frozen=True, kw_only=True):
         return f"{self.task}/{self.learner}/{self.representation}"
 
 
+class Cloned(CloneSettings, frozen=True, kw_only=True):
+    """How a policy was learned from a data set alone; its run's steps are gradient steps."""
+
+    data: Sha256  # the data set's fingerprint
+
+
 class RunSettings(SharedSettings, frozen=True, kw_only=True):
     """All of a run; together with versions they decide every number, on one kind of CPU."""
 
@@ -59,11 +66,17 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
     # whether it was trained and evaluated in one instance of its environment; evaluations then wait
     # for the end of an episode of training
     one_robot: Literal[True] | UnsetType = UNSET
+    cloned: Cloned | UnsetType = UNSET  # how it was learned from data, without an environment
 
     @property
     def name(self) -> str:
         """The label with the seed: face_direction/sac-modern/dae-8/seed-0."""
         return f"{self.label}/seed-{self.seed}"
+
+    @property
+    def chunk(self) -> int:
+        """How many actions the policy chooses at once."""
+        return self.cloned.chunk if self.cloned else 1
 
     def is_evaluation_due(self, step: int, keep_checkpoint: bool = False) -> bool:
         """Whether the policy is to be evaluated after so many steps.

@@ -1,6 +1,6 @@
 """The settings of runs, and the names of what they choose from."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
@@ -8,6 +8,7 @@ from jbrep.errors import InputError
 from jbrep.records.record import Record, pattern
 
 CPU, CUDA = "cpu", "cuda"
+BC: Final = "bc"  # behaviour cloning
 MAX_STEPS = 10**12  # of training
 MAX_EPISODES = 10_000  # of an evaluation
 
@@ -34,6 +35,40 @@ Line = Annotated[  # nothing in it controls a terminal
 ]
 Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]
 Episodes = Annotated[int, Meta(ge=1, le=MAX_EPISODES)]
+
+
+class CloneSettings(Record, frozen=True, kw_only=True):
+    """How a policy is learned from a data set alone."""
+
+    method: Annotated[
+        Literal["bc", "td3+bc"],
+        Meta(description="Behaviour cloning; or TD3+BC, offline RL, which needs rewards."),
+    ] = BC
+    loss: Annotated[
+        Literal["squared", "gaussian"],
+        Meta(description="Of cloning: squared error, or a Gaussian's negative log-likelihood."),
+    ] = "squared"
+    chunk: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=1000,
+            description="Of cloning: actions that are chosen at once and played before the policy "
+            "looks again.",
+        ),
+    ] = 1
+    patience: Annotated[
+        int,
+        Meta(ge=1, description="Of cloning: epochs without a lower held-out loss that end it."),
+    ] = 10
+    alpha: Annotated[
+        float, Meta(gt=0, le=10**6, description="Of TD3+BC: weight of the value in its actor.")
+    ] = 2.5
+
+    def check(self) -> None:
+        for name, usual in (("loss", "squared"), ("chunk", 1)):
+            if self.method != BC and (given := getattr(self, name)) != usual:
+                raise InputError(f"{name} is {given}: with {self.method} leave it out")
 
 
 class TrainingSettings(Record, frozen=True, kw_only=True):

@@ -343,7 +343,7 @@ def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | 
         tables |= read_run(folder).tables
     else:
         (folder / RUN).unlink(missing_ok=True)  # of fewer steps, before its files change
-        tables |= _write_tables(folder, history)
+        tables |= write_tables(folder, history)
         if policy:
             write_whole(folder / POLICY, policy)
             write_whole(folder / POLICY_ZIP, policy_zip(agent))
@@ -368,7 +368,8 @@ def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | 
     return record
 
 
-def _write_tables(folder: Path, history: History) -> dict[str, str]:
+def write_tables(folder: Path, history: History) -> dict[str, str]:
+    """Write the tables of a run; their SHA-256 by name."""
     tables = {
         EPISODES: write_rows(folder / EPISODES, history.episodes, Episode),
         EVALUATIONS: write_rows(folder / EVALUATIONS, history.evaluations, Evaluation),

@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -23,13 +23,14 @@ class Objective(nn.Module, ABC):
     Attributes:
         encoder: gives the code.
         horizon: steps that a window reaches ahead.
-        moving_target: whether the loss is against a target that learns as well, so that losses of
-            different epochs can't be compared: the last epoch is kept then, not that of least loss.
+        kept_by: the loss of which the epoch with the least is kept, so that held-out rows have no
+            influence if it is that of training; None keeps the last one, as where the target of the
+            loss learns as well, so that losses of different epochs can't be compared.
     """
 
     encoder: nn.Sequential
     horizon: int = 0
-    moving_target: bool = False
+    kept_by: Literal["train_loss", "test_loss"] | None = "train_loss"
 
     def prepare(self, windows: Windows) -> None:
         """Fit what is constant in training, such as scales of targets, to training windows."""

@@ -45,6 +45,15 @@ class Epoch(NamedTuple):
     test_loss: Finite  # after the epoch, from clean held-out rows
 
 
+class Schedule(NamedTuple):
+    """How long to train, and how."""
+
+    epochs: int
+    batch_size: int | None
+    learning_rate: float
+    seed: int
+
+
 class _Checkpoint(Record, frozen=True, kw_only=True):
     identity: dict[str, Any]  # what must be equal for training to resume
     history: tuple[Epoch, ...]
@@ -70,15 +79,14 @@ class Trainer:
 
     Attributes:
         objective, optimiser: after the last epoch.
-        best: parameters after the epoch with the lowest training loss, or the last one where losses
-            can't be compared; held-out rows have no influence on the choice.
+        best: parameters after the epoch that the objective's `kept_by` names.
         history: the epochs so far.
     """
 
     def __init__(
         self,
         objective: Objective,
-        schedule: "Learned",
+        schedule: "Learned | Schedule",
         windows: Windows,
         watched: Windows,
     ):
@@ -97,15 +105,18 @@ class Trainer:
     @property
     def best_epoch(self) -> int:
         """The epoch whose parameters are kept, from 1; 0 before the first."""
-        if self.objective.moving_target or not self.history:
+        kept_by = self.objective.kept_by
+        if kept_by is None or not self.history:
             return len(self.history)
-        losses = [epoch.train_loss for epoch in self.history]
+        losses = [getattr(epoch, kept_by) for epoch in self.history]
         return losses.index(min(losses)) + 1
 
-    def epochs(self) -> Iterator[Epoch]:
-        """Train to the end, yielding each epoch."""
+    def epochs(self, patience: int | None = None) -> Iterator[Epoch]:
+        """Train to the end, yielding each epoch; or until so many were no better than the best."""
         with single_torch_thread():
             while len(self.history) < self.schedule.epochs:
+                if patience and len(self.history) - self.best_epoch >= patience:
+                    return
                 self._epoch()
                 yield self.history[-1]
 

@@ -77,6 +77,20 @@ class Windows:
         """Of each window the first row (n, size), its action (n, k), and the next row (n, size)."""
         return self.rows(numbers), self.actions(numbers)[:, 0], self.rows(numbers, 1)
 
+    def after(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """What follows each window's first row, (n, size), also at the end of its episode.
+
+        And whether a state ended the episode there, 1 or 0, (n,).
+        """
+        rows, ended = self._following
+        first = self._first(numbers)
+        return rows.index_select(0, first), ended.index_select(0, first)
+
+    @property
+    def first_rows(self) -> NDArray[np.int64]:
+        """The first row of each window, by its number in the data set, (n,)."""
+        return self._rows[self._first(self.numbers).numpy(force=True)]
+
     def rewards(self, numbers: Tensor, count: int = 1) -> Tensor:
         """The mean of the first rewards of each window, (n,)."""
         first = self._first(numbers)
@@ -86,6 +100,16 @@ class Windows:
     @cached_property
     def _scaled(self) -> Tensor:
         return torch.from_numpy(self._data.load(self._rows)).to(self.device)
+
+    @cached_property
+    def _following(self) -> tuple[Tensor, Tensor]:
+        episodes, rows = self._data.dataset.episodes, self._scaled.roll(-1, 0)
+        lasts = np.cumsum(episodes["length"], dtype=np.int64) - 1
+        own, ended = np.isin(lasts, self._rows), np.zeros(len(rows), np.float32)
+        places = np.searchsorted(self._rows, lasts[own])
+        finals = self._data.scale(episodes["final_observation"][own])
+        rows[places], ended[places] = torch.from_numpy(finals).to(rows), episodes["terminated"][own]
+        return rows, torch.from_numpy(ended).to(self.device)
 
     @cached_property
     def _action(self) -> Tensor:

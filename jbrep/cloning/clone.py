@@ -1,0 +1,290 @@
+"""A policy that is learned from a data set, in the folder of a run, like those of jbrep rl."""
+
+import hashlib
+import math
+import time
+from collections.abc import Mapping
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from msgspec import Meta
+
+from jbrep.cloning.objective import Cloning, Seen
+from jbrep.cloning.td3_bc import TD3BC
+from jbrep.dataset import Dataset
+from jbrep.encoders import Encoder, save
+from jbrep.encoders.base import BaseEncoder
+from jbrep.envs.lanes import lanes_at_once
+from jbrep.envs.names import environment_versions, spec_of
+from jbrep.envs.recording import Outcome, joined, whole_outcome
+from jbrep.errors import InputError
+from jbrep.machine import cpu
+from jbrep.progress import Progress
+from jbrep.records.commit import commits
+from jbrep.records.document import Document, read_document
+from jbrep.records.record import Finite, to_plain
+from jbrep.records.storage import exclusive, exists, make_folder, write_whole
+from jbrep.rl.files import ENCODER, EVALUATION_SEED, FINISHED, OWN, POLICY, RUN, RunRecord, read_run
+from jbrep.rl.history import History
+from jbrep.rl.learner import Learner, usual_name
+from jbrep.rl.policy import Trained, build, pack_whole
+from jbrep.rl.presets import LINEAR, MODERN, argument
+from jbrep.rl.run import Run
+from jbrep.rl.run_settings import Cloned, RunSettings
+from jbrep.rl.settings import BC, CloneSettings, Line
+from jbrep.rl.training import packages, write_tables
+from jbrep.stats.intervals import LEVEL, Bounds, mean_within
+from jbrep.text import Table, counted, interval, number, r2_text
+from jbrep.training.trainer import Epoch, Schedule, Trainer, get_device, single_thread
+from jbrep.training.windows import Windows, count_windows, watched_windows
+
+CLONE = "clone.json"
+_CHECKPOINT = "training.safetensors"  # until the training has ended
+_SAVE_EVERY = 10.0  # seconds between checkpoints, at least
+_STEPS = {BC: 20_000, "td3+bc": 100_000}  # gradient steps where nothing is said
+_AT_ONCE, _TIMES = 10, 10  # episodes that are played; parts of the longest episode
+_FOR_NETWORK, _FOR_ALL = ("net_arch", "activation_fn"), ("learning_rate", "batch_size")
+_FOR_TD3 = ("gamma", "tau", "policy_delay", "target_policy_noise", "target_noise_clip")
+_BASES: dict[str, tuple[str, dict[str, Any]]] = {  # whose policy it is, by the loss
+    "squared": ("td3", {}),
+    "gaussian": ("ppo", {"net_arch": [256, 256], "batch_size": 256}),
+}
+
+
+class Part(NamedTuple):
+    """How well some of the held-out actions are told."""
+
+    name: str
+    mse: Finite  # of actions scaled to [-1, 1]
+    r2: Finite | None  # None where they don't vary
+
+
+class Mean(NamedTuple):
+    """The mean return of some episodes, with its 95 % interval; none where nothing varies."""
+
+    episodes: Annotated[int, Meta(ge=1)]
+    mean: Finite
+    low: Finite | None
+    high: Finite | None
+
+    def __str__(self) -> str:
+        shown = interval((self.mean, self.low, self.high), ",.4g")
+        return f"{shown} in {counted(self.episodes, 'episode')}"
+
+
+class CloneRecord(Document, frozen=True, kw_only=True):
+    """clone.json: what is known of a policy that was learned from data."""
+
+    format = "jbrep clone"
+    format_version = 1
+
+    epochs: tuple[Epoch, ...]
+    best_epoch: Annotated[int, Meta(ge=1)]  # whose policy is kept
+    error: Part  # of all actions
+    actions: tuple[Part, ...]
+    times: tuple[Part, ...]  # of ten parts of the longest held-out episode, by their steps
+    data: Mean | None  # of the data's episodes; None without rewards
+    policy: Mean | None  # None if it wasn't played
+    note: Line  # why it wasn't, or why the two can't be compared; empty if they can
+
+    def card(self, width: int | None) -> str:
+        """What a reader wants to know of it."""
+        parts = self.error, *(self.actions if len(self.actions) > 1 else ()), *self.times
+        rows = [(each.name, number(each.mse, ".4f"), r2_text(each.r2)) for each in parts]
+        kept = f"epoch {self.best_epoch} of {len(self.epochs)} is kept; held-out actions:"
+        lines = [kept, Table("", ("", "error", "R²"), rows).text(width)]
+        means = (("policy", self.policy), ("data", self.data))
+        told = "; ".join(f"{name} {mean}" for name, mean in means if mean)
+        return "\n".join(lines + ([f"mean return [95 %]: {told}"] if told else []))
+
+
+class Job(NamedTuple):
+    """What to learn, once all of it has been checked."""
+
+    data: Dataset
+    encoder: BaseEncoder
+    settings: RunSettings
+    how: Cloned
+    given: dict[str, Any]  # settings of the training, by stable-baselines3's names
+
+    @classmethod
+    def of(
+        cls,
+        data: Dataset,
+        encoder: Any,
+        how: CloneSettings,
+        overrides: Mapping[str, Any],
+        **of_run: Any,
+    ) -> "Job":
+        """A policy to learn from data, as `jbrep.clone` describes it; `of_run` are a run's fields.
+
+        The run that it is written as is one of the algorithm whose policy it has.
+        """
+        algorithm, usual = _BASES[how.loss]
+        of_training = (*_FOR_ALL, *(_FOR_TD3 if how.method != BC else ()))
+        for name, value in overrides.items():
+            if name not in (known := (*_FOR_NETWORK, *of_training)):
+                raise InputError(f"{how.method} has no setting {name!r}: it has {', '.join(known)}")
+            if str(value).startswith(LINEAR):
+                raise InputError(f"{name} is {value}: it must be a number here, not a schedule")
+        label = "-gaussian" if how.loss == "gaussian" else ""
+        label += f"-chunk{how.chunk}" if how.chunk > 1 else ""
+        learner = Learner(
+            name=usual_name(f"{how.method}{label}", overrides),
+            algorithm=algorithm,
+            preset=MODERN,
+            overrides={**usual, **overrides, "normalize": True},
+        )
+        of_run["steps"] = of_run["evaluate_every"] = of_run["steps"] or _STEPS[how.method]
+        of_run["evaluation_episodes"] = min(_AT_ONCE, of_run["final_episodes"])
+        run = Run(task=data.task, learner=learner, encoder=encoder, **of_run)
+        found, chosen = run.find_encoder(), learner.hyperparameters
+        given = {name: argument(algorithm, chosen, name) for name in of_training}
+        cloned = Cloned(**to_plain(how), data=data.fingerprint)
+        settings = run.settings(found).replace(
+            hyperparameters=chosen.replace(algorithm_kwargs=given, noise=None, num_envs=1),
+            cloned=cloned,
+        )
+        return cls(data, found, settings, cloned, given)
+
+
+def learn(job: Job, folder: Path, threads: int | None = None) -> tuple[RunRecord, CloneRecord]:
+    """Learn a policy and write its folder, unless it is complete; what was killed goes on."""
+    make_folder(folder, (*OWN, CLONE, _CHECKPOINT))
+    with exclusive(folder), single_thread():
+        if not exists(folder / RUN):
+            _learn(job, folder, threads)
+        run = read_run(folder)
+        if differing := run.settings.differing(job.settings):
+            raise InputError(f"{folder} has another run: {differing}; choose another folder")
+        return run, read_document(folder / CLONE, CloneRecord)
+
+
+def _learn(job: Job, folder: Path, threads: int | None) -> None:
+    began, settings, how = time.monotonic(), job.settings, job.how
+    seen = Seen(job.data, job.encoder)
+    if how.method != BC and not seen.reward_varies:
+        raise InputError(
+            f"{how.method} needs rewards that vary, and {job.data.folder} has none: jbrep data "
+            f"derive --reward gives some, or take the method {BC}"
+        )
+    trained = build(settings, job.encoder, folder)._replace(statistics=seen.statistics)
+    objective = Cloning(trained.policy, how.chunk)
+    if how.method != BC:
+        objective = TD3BC(trained.policy, how.alpha, job.given)
+    trainer, watched = _train(job, objective, seen, folder / _CHECKPOINT)
+    objective.load_state_dict(trainer.best)
+    objective.eval()
+    parts = _parts(objective, watched, job.data)
+    objective.to("cpu")
+    history, played, theirs = History(), None, job.data.episodes.get("return")
+    if not (note := _why_not_played(job.data)):
+        outcome = _play(trained, settings, threads)
+        history.add(settings.steps, outcome)
+        played = _mean(outcome.returns, trained)
+        if job.data.manifest.settings.reward:
+            note = "the data's rewards aren't the environment's: their returns can't be compared"
+    record = CloneRecord(
+        epochs=tuple(trainer.history),
+        best_epoch=trainer.best_epoch,
+        **parts,
+        data=None if theirs is None else _mean(theirs, trained),
+        policy=played,
+        note=note,
+    )
+    if isinstance(job.encoder, Encoder):
+        save(job.encoder, folder / ENCODER)
+    policy = pack_whole(trained)
+    write_whole(folder / POLICY, policy)
+    record.write(folder / CLONE)
+    RunRecord(
+        status=FINISHED,
+        reason=None,
+        settings=settings,
+        latent_size=job.encoder.latent_size,
+        steps=settings.steps,
+        seconds=round(time.monotonic() - began, 1),
+        versions=packages() | (environment_versions(job.data.task) if played else {}),
+        commits=commits(),
+        cpu=cpu(),
+        tables=write_tables(folder, history),
+        policy_sha256=hashlib.sha256(policy).hexdigest(),
+    ).write(folder / RUN)  # last: it is complete where this exists
+    (folder / _CHECKPOINT).unlink(missing_ok=True)
+
+
+def _train(job: Job, objective: Cloning, seen: Seen, checkpoint: Path) -> tuple[Trainer, Windows]:
+    """Train to the end; the trainer, and held-out windows."""
+    settings, device = job.settings, get_device(job.settings.device)
+    objective.to(device)
+    count = count_windows(seen, objective.horizon)
+    size = min(job.given["batch_size"], count)
+    epochs = math.ceil(settings.steps / math.ceil(count / size))
+    schedule = Schedule(epochs, size, job.given["learning_rate"], settings.seed)
+    watched = watched_windows(seen, objective.horizon, device)
+    windows = Windows(seen, seen.train, objective.horizon, device)
+    trainer = Trainer(objective, schedule, windows, watched)
+    identity = {**to_plain(settings), "torch": packages()["torch"]}
+    if exists(checkpoint):
+        trainer.restore(identity, checkpoint)
+    saved, done = time.monotonic(), len(trainer.history)
+    with Progress(total=epochs, initial=done, desc=settings.learner, unit="epoch") as progress:
+        for epoch in trainer.epochs(job.how.patience if job.how.method == BC else None):
+            progress.set_postfix(train=f"{epoch.train_loss:.5f}", test=f"{epoch.test_loss:.5f}")
+            progress.update()
+            if time.monotonic() - saved > _SAVE_EVERY:
+                trainer.save(identity, checkpoint)
+                saved = time.monotonic()
+    trainer.save(identity, checkpoint)
+    return trainer, watched
+
+
+def _parts(objective: Cloning, watched: Windows, data: Dataset) -> dict[str, Any]:
+    """The parts of a record, of held-out windows."""
+    errors, actions = objective.errors(watched)
+    deviations = actions - actions.mean(axis=(0, 1))
+
+    def part(name: str, *place: Any) -> Part:
+        mse, variance = (float(np.square(each[place]).mean()) for each in (errors, deviations))
+        return Part(name, mse, 1 - mse / variance if variance > 1e-12 else None)
+
+    steps = data["step"][watched.first_rows]
+    edges = np.unique(np.linspace(0, steps.max() + 1, _TIMES + 1).astype(int))
+    named = [(f"steps {a:,}-{b - 1:,}", (a <= steps) & (steps < b)) for a, b in pairwise(edges)]
+    return {
+        "error": part("all", ...),
+        "actions": tuple(part(f"action_{i}", ..., i) for i in range(actions.shape[-1])),
+        "times": tuple(part(name, own) for name, own in named if own.any()),
+    }
+
+
+def _play(trained: Trained, settings: RunSettings, threads: int | None) -> Outcome:
+    """What comes of the episodes that every run is evaluated on."""
+    count = settings.final_episodes
+    with lanes_at_once(trained.task, settings.evaluation_episodes, threads, 0) as lanes:
+        seeds = range(EVALUATION_SEED, EVALUATION_SEED + count, lanes.num_lanes)
+        begin = partial(trained.begin, trained.task, ())
+        return joined((whole_outcome(lanes, begin, seed) for seed in seeds), count)
+
+
+def _why_not_played(data: Dataset) -> str:
+    """Why no policy can be played in the environment of data; empty if one can."""
+    try:
+        spec_of(data.task)
+    except (InputError, ModuleNotFoundError) as error:
+        named = "names no environment" if data.manifest.settings.is_imported else f"needs: {error}"
+        return (
+            f"{data.folder} {named}, so the policy wasn't played: a low error doesn't say what it "
+            "returns, as errors lead to states that aren't in the data, and to larger errors"
+        )
+    return ""
+
+
+def _mean(returns: Any, trained: Trained) -> Mean:
+    bounds = Bounds.of(trained.task.return_floor, trained.task.return_ceiling)
+    found = mean_within(np.asarray(returns, np.float64), bounds, LEVEL)
+    low, high = (float(end) if np.isfinite(end) else None for end in (found.low, found.high))
+    return Mean(len(returns), float(found.value), low, high)
