@@ -35,7 +35,7 @@ from jbrep.parameters import (
     Workers,
     find_study,
 )
-from jbrep.rl.settings import CloneSettings, Episodes, Seed, TrainingSettings
+from jbrep.rl.settings import CloneSettings, Seed, TrainingSettings
 from jbrep.rl.settings import Steps as TrainingSteps
 
 if TYPE_CHECKING:
@@ -438,7 +438,7 @@ def clone(
     seed: Seed = 0,
     steps: TrainingSteps | None = None,
     overrides: Overrides = NOTHING,
-    episodes: Episodes = 50,
+    episodes: Annotated[int, Meta(ge=1, le=10_000)] = 50,
     threads: Threads = None,
     device: str = "cpu",
     **settings: Annotated[Any, CloneSettings],
