@@ -105,7 +105,7 @@ def test_every_command_has_help_with_an_example(command):
 
 MISTAKES = {
     "collect --task fly --steps 1k --out x": "unknown task 'fly'",
-    "env environments:Sledge": "Sledge in environments is a class: register it there, as in",
+    "env environments:Sledge": "Sledge has no time limit: give one with --episode-steps",
     "train-dae --data none --latent 8 --out x": "no data set in none",
     "data derive none --task fly --out x": "no data set in none",
     "data fly": "No such command 'fly'. See jbrep data --help.",

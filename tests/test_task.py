@@ -343,7 +343,7 @@ def test_a_class_or_an_instance_is_a_task(monkeypatch, tmp_path):
     assert task.id == "instance/Sledge"
     data = api.collect(task, tmp_path / "data", 60)
     assert len(data) >= 60
-    agent = api.train(task, tmp_path / "run", algorithm="a2c", steps=32, final_episodes=1)
+    agent = api.train(task, tmp_path / "run", algorithm="a2c", steps=32, evaluation_episodes=1)
     assert agent.record.settings.one_robot
     assert "it must be a name, a Task or an environment" in refused(describe, 7)
 

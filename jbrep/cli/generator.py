@@ -22,7 +22,6 @@ import click
 from msgspec import NODEFAULT, Meta
 
 from jbrep.errors import InputError
-from jbrep.records.document import read_toml
 from jbrep.records.keys import Key, keys_of, option_name
 from jbrep.records.record import converted, from_text
 
@@ -323,6 +322,8 @@ def _project_modules(here: Path) -> list[str]:
     top = next((i for i, folder in enumerate(above) if (folder / ".git").exists()), 0)
     for folder in above[: top + 1]:
         if (file := folder / "pyproject.toml").is_file():
+            from jbrep.records.document import read_toml
+
             own = read_toml(file).get("tool", {}).get("jbrep", {})
             if modules := own.get("import"):
                 sys.path.append(str(folder))
