@@ -47,8 +47,8 @@ def test_a_run_from_training_to_its_returns(tmp_path):
         r"face_direction on dae-8: median return [\d.]+ \[[\d.]+, [\d.]+\] .*\n", told
     )
     table = jbrep("report", tmp_path / "runs").output.splitlines()
-    assert ["face_direction/a2c/dae-8", "0", "finished"] in [line.split()[:3] for line in table]
-    why = "face_direction/a2c/dae-8: one run has ended, at least two are needed"
+    assert ["face_direction/a2c-paper/dae-8", "0", "finished"] in [line.split()[:3] for line in table]
+    why = "face_direction/a2c-paper/dae-8: one run has ended, at least two are needed"
     assert f"No statistics: {why}" in " ".join(table)
     assert (tmp_path / "runs" / "returns.csv").exists()
     again = jbrep("rl", "--task", "face_direction", "--seed", 1, "--out", run)
@@ -60,7 +60,7 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
     (tmp_path / "tiny.toml").write_text(TOML)
     dry = ("study", tmp_path / "tiny.toml", "--dry-run", "--workers", 2, "--out", tmp_path / "dry")
     told = jbrep(*dry).output
-    assert re.search(r"\nface_direction/a2c/pca-8 +2 +[\d.]+ \w+\n", told)
+    assert re.search(r"\nface_direction/a2c-paper/pca-8 +2 +[\d.]+ \w+\n", told)
     assert re.search(r"4 runs to go, 0 done; [\d.]+ \w+ on one core, [\d.]+ \w+ with 2 ", told)
     for arguments, message in (
         (("studies/none.toml",), "studies/none.toml"),

@@ -103,7 +103,7 @@ def test_evaluate_policy_says_them(run):
 def study(tmp_path_factory):
     """The folder of a tiny study, finished, and what its report says."""
     folder = tmp_path_factory.mktemp("infos") / "study"
-    tiny = {"algorithms": ("a2c",), "representations": ("full",), "seeds": (0, 1), "steps": 40}
+    tiny = {"algorithms": ("a2c-paper",), "representations": ("full",), "seeds": (0, 1), "steps": 40}
     tiny |= {"evaluate_every": 40, "evaluation_episodes": 1, "final_episodes": EPISODES}
     plan = Plan(Study(tasks=(SCORED, "Sledges/Sledge-v0"), **tiny), folder)
     assert run_study(plan, in_this_process, 1) == 0
@@ -119,7 +119,7 @@ def test_a_study_has_them_in_a_table_of_its_own(study, tmp_path):
     folder, _ = study
     tables = read_tables(folder)
     assert tables.infos == [
-        RunInfo(SCORED, "a2c", "full", seed, step, episode, *each)
+        RunInfo(SCORED, "a2c-paper", "full", seed, step, episode, *each)
         for seed in (0, 1)
         for step, episodes in ((0, 1), (40, EPISODES))
         for episode in range(episodes)
@@ -146,7 +146,7 @@ def test_shares_are_of_last_evaluations_and_have_intervals(study):
     first, *_ = tables.record.runs
     made = [first.replace(seed=seed) for seed in range(5)]
     made[4] = first.replace(seed=4, status="failed", reason="of heat")
-    key = (SCORED, "a2c", "full")
+    key = (SCORED, "a2c-paper", "full")
     returns = [Return(*key, seed, step, 0, 1.0) for seed in range(5) for step in (0, 40)]
     infos = [
         RunInfo(*key, seed, step, episode, "won", float(step == 40 and episode <= seed))
