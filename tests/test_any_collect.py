@@ -34,7 +34,7 @@ def some(task=SLEDGE, **changes):
     return settings(**(usual | changes))
 
 
-LONG = some(steps=15_000, shard_episodes=50)
+LONG = some(steps=8_000, shard_episodes=50)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_a_stopped_and_a_killed_collector_are_resumed(long, tmp_path, monkeypatc
     data = tmp_path / "data"
     command = ("collect", "--task", f"environments:{ID}", "--steps", LONG.steps, "--seed", 3)
     command += ("--shard-episodes", 50, "--threads", 2, "--out", data)
-    for number, shard, status in ((signal.SIGINT, 1, 130), (signal.SIGKILL, 6, -9)):
+    for number, shard, status in ((signal.SIGINT, 1, 130), (signal.SIGKILL, 3, -9)):
         process = start(*command)
         seen = (data / f"shard-{shard:05d}.h5").exists
         assert wait_for(seen, process), process.communicate()

@@ -82,6 +82,7 @@ def test_encoders_are_judged_by_names_and_as_a_dictionary(home):
         jbrep.evaluate([path, path], home / "data")
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_a_study_without_a_file(home):
     study = jbrep.Study(
         tasks=("Pendulum-v1",),

@@ -14,11 +14,12 @@ from jbrep.evaluation import regression
 from jbrep.studies.runner import BACKENDS
 
 ROOT = Path(__file__).parent.parent
+EPISODES = {"--evaluation-episodes": "1", "--final-episodes": "1"}
 LESS = {  # by command: numbers in place of a page's, or beside them
     "collect": {"--steps": "1k", "--episode-steps": "100"},
     "train-dae": {"--epochs": "2"},
     "train-encoder": {},
-    "rl": {"--steps": "200", "--evaluation-episodes": "1", "--episode-steps": "100"},
+    "rl": {"--steps": "200", "--episode-steps": "100", **EPISODES},
     "tune": {"--steps": "1100", "--trials": "1", "--evaluation-episodes": "1"},
     "render": {"--seconds": "0.5", "--size": "64x64"},
     "evaluate-policy": {"--episodes": "2"},
@@ -26,7 +27,7 @@ LESS = {  # by command: numbers in place of a page's, or beside them
 STUDY = {
     "seeds": "1",
     "steps": "100",
-    "evaluate_every": "50",
+    "evaluate_every": "100",
     "evaluation_episodes": "1",
     "final_episodes": "2",
 }
@@ -94,7 +95,7 @@ def test_ten_minutes_lead_from_a_robot_to_a_code(tmp_path, monkeypatch):
     monkeypatch.setattr(regression, "_STEPS", 100)
     monkeypatch.chdir(tmp_path)
     (study,) = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs/worth.md").read_text(), re.M | re.S)
-    for key, value in {**STUDY, "final_episodes": "2"}.items():
+    for key, value in STUDY.items():
         study = re.sub(rf"^{key} = .*\n", "", study, count=1, flags=re.M)
         study = f"{key} = {value}\n{study}"
     (tmp_path / "choice.toml").write_text(study.replace("steps = 20_000", "steps = 2_000"))

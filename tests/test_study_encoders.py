@@ -10,7 +10,7 @@ import pytest
 from command import in_this_process, jbrep
 from judged import diagnostics, evaluation
 from my_encoders import LATENT, SIZE, FirstFeatures, dense
-from small import forge
+from small import ONE_EACH, forge
 from test_convert import model
 from test_study import TINY as TINY_STUDY
 
@@ -44,7 +44,7 @@ SHARED = {
     "preset": "paper",
     "steps": 80,
     "evaluate_every": 80,
-    "evaluation_episodes": 1,
+    **ONE_EACH,
 }
 TINY = TINY_STUDY.replace(representations=("full",), episode_steps=50)
 
@@ -320,7 +320,15 @@ def test_a_mistaken_representation_is_refused(given, field):
 def test_a_run_on_code(done, tmp_path, monkeypatch):
     out = tmp_path / "run"
     options = ("--task", TASK, "--episode-steps", 50, "--algorithm", "a2c", "--steps", 80)
-    options += ("--evaluate-every", 80, "--evaluation-episodes", 1, "--encoder")
+    options += (
+        "--evaluate-every",
+        80,
+        "--final-episodes",
+        1,
+        "--evaluation-episodes",
+        1,
+        "--encoder",
+    )
     told = jbrep("rl", *options, NET, "--out", out)
     assert told.exit_code == 0, told.output
     assert f"encoder: {NET}, code" in told.stdout
