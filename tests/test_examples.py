@@ -39,7 +39,7 @@ LESS = {  # to do in own.py
     "episode_steps = 100": "episode_steps = 20",
     "range(200)": "range(20)",
     "--episode-steps 100 --steps 2k": "--episode-steps 100 --steps 500",
-    "learning_rate=1e-3 --steps 4k": "learning_rate=1e-3 --steps 40 --final-episodes 2",
+    "learning_rate=1e-3 --steps 4k": "learning_rate=1e-3 --steps 40 --evaluation-episodes 1",
     "--policy uniform:0.5+run:0.5 --steps 2k": "--policy uniform:0.5+run:0.5 --steps 500",
     "face_direction --steps {steps}": "face_direction --steps {steps} --episode-steps 100",
 }

@@ -14,13 +14,14 @@ from jbrep.evaluation import regression
 from jbrep.studies.runner import BACKENDS
 
 ROOT = Path(__file__).parent.parent
+SMALL = {"--evaluation-episodes": "1", "--set": "net_arch=[16]"}
 EPISODES = {"--evaluation-episodes": "1", "--final-episodes": "1"}
 LESS = {  # by command: numbers in place of a page's, or beside them
     "collect": {"--steps": "1k", "--episode-steps": "100"},
     "train-dae": {"--epochs": "2"},
     "train-encoder": {},
     "rl": {"--steps": "200", "--episode-steps": "100", **EPISODES},
-    "tune": {"--steps": "1100", "--trials": "1", "--evaluation-episodes": "1"},
+    "tune": {"--steps": "1100", "--trials": "1", "--episode-steps": "100", **SMALL},
     "render": {"--seconds": "0.5", "--size": "64x64"},
     "evaluate-policy": {"--episodes": "2"},
 }

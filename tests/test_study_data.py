@@ -1,5 +1,6 @@
 """The data that a study's encoders are made from: several, by policies, made by several workers."""
 
+import pickle
 import tomllib
 
 import pytest
@@ -55,7 +56,8 @@ def in_turn(monkeypatch):
     """Workers that are no processes: test_study has some."""
 
     def make(function, next_job, workers):
-        return ((job, function(job)) for job in iter(next_job, None))
+        jobs = map(pickle.dumps, iter(next_job, None))
+        return ((job, function(job)) for job in map(pickle.loads, jobs))
 
     monkeypatch.setattr("jbrep.studies.prepare.side_by_side", make)
 

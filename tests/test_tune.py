@@ -5,6 +5,7 @@ import tomllib
 import pytest
 import wandb
 from command import jbrep, mistake
+from small import ONE_EACH
 
 from jbrep.envs import describe
 from jbrep.errors import InputError
@@ -20,8 +21,8 @@ RUN = Run.of(
     algorithm="a2c",
     preset="modern",
     steps=128,
-    evaluation_episodes=1,
     overrides={"net_arch": [8]},
+    **ONE_EACH,
 )
 
 
