@@ -11,7 +11,7 @@ TASKS := move_from_origin face_direction move_in_direction move_to_position move
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures docs figures samples data encoders decoded $(STUDIES) answer programme programme-time worth $(SCORED) policies behaviour clean
+.PHONY: help setup demo test test-all coverage check bench pictures docs figures samples data encoders decoded $(STUDIES) answer programme programme-time worth $(SCORED) policies behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -41,8 +41,11 @@ demo: $(READY_DEMO) ## the whole job in minutes: collect, train and judge encode
 	@echo "the report: $(DEMO)/study/report.html"
 	@echo "an agent that has learned to turn: $(BIN)/rerun $(DEMO)/run.rrd"
 
-test: $(READY) ## the test suite
+test: $(READY) ## the test suite, in minutes
 	$(BIN)/python -m pytest
+
+test-all: $(READY) ## the same with its slow tests
+	$(BIN)/python -m pytest -m ''
 
 coverage: $(READY) ## the test suite, with the lines of jbrep/ that no test runs
 	$(BIN)/python -m pytest --cov

@@ -132,12 +132,12 @@ def diverging(brief, monkeypatch, tmp_path):
     monkeypatch.setattr(Simulation, "step", spoil)
 
 
-LONGEST = ("test_cluster", "test_whole", "test_study", "test_rl", "test_cli", "test_report")
+LONGEST = ("study", "readme", "docs", "verdicts", "golden", "examples", "rl", "fit", "rl_tasks")
 
 
 def pytest_collection_modifyitems(items):
-    """The longest first, so that no worker is left with one while the others are done."""
+    """The longest files first, so that no worker is left with one while the other is done."""
     for item in items if NO_SUITE else ():
         if "dm_control/" in item.nodeid:
             item.add_marker(pytest.mark.skip(reason="needs jbrep[suite]"))
-    items.sort(key=lambda item: item.module.__name__ not in LONGEST)
+    items.sort(key=lambda item: item.module.__name__.removeprefix("test_") not in LONGEST)

@@ -7,12 +7,14 @@ import warnings
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from command import in_this_process
 
 import jbrep
 from jbrep.cli import main
 from jbrep.envs.names import imported_modules
 from jbrep.errors import InputError, Notice
 from jbrep.rl.policy_file import find_shipped as find
+from jbrep.studies.runner import BACKENDS
 
 QUICK = {"steps": 64, "evaluate_every": 64, "evaluation_episodes": 1, "final_episodes": 3}
 
@@ -84,7 +86,9 @@ def test_encoders_are_judged_by_names_and_as_a_dictionary(home):
         jbrep.evaluate([path, path], home / "data")
 
 
-def test_a_study_without_a_file(home):
+@pytest.mark.usefixtures("one_figure")
+def test_a_study_without_a_file(home, monkeypatch):
+    monkeypatch.setitem(BACKENDS, "local", in_this_process)
     study = jbrep.Study(
         tasks=("Pendulum-v1",),
         episode_steps=20,

@@ -182,7 +182,7 @@ def test_offline_rl_does_better_than_what_acted(home, log):
 
 @pytest.fixture(scope="module")
 def upright(home):
-    task = jbrep.describe("InvertedPendulum-v5", max_episode_steps=4)
+    task = jbrep.describe("InvertedPendulum-v5", episode_steps=4)
     return jbrep.collect(task, home / "upright", 400, seed=1)
 
 

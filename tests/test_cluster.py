@@ -13,18 +13,20 @@ from test_any_collect import some
 from test_study import TINY
 
 from jbrep.collecting import collect
+from jbrep.envs import describe
 from jbrep.studies import runner
 from jbrep.studies.plan import Plan
 from jbrep.studies.runner import work
 from jbrep.studies.tables import read_tables, write_tables
 
+ray = pytest.importorskip("ray")
 DATA = some(steps=12_000, shard_episodes=50)
 STUDY = TINY.replace(seeds=(0,), steps=1000, evaluate_every=1000)
 
 
+@pytest.mark.slow
 def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
     """One cluster for both: it takes seconds to start."""
-    pytest.importorskip("ray")
     told = subprocess.run(
         [sys.executable, Path(__file__).parent / "helpers" / "cluster.py", tmp_path],
         capture_output=True,
@@ -45,9 +47,20 @@ def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
         np.testing.assert_array_equal(ours.returns, theirs.returns)
 
 
+def test_data_from_a_cluster_are_the_same(tmp_path, monkeypatch):
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    made = some(describe("Pendulum-v1", episode_steps=20), steps=100)
+    collect(made, tmp_path / "here", num_threads=1)
+    try:
+        collect(made, tmp_path / "there", num_threads=1, backend="ray")
+    finally:
+        ray.shutdown()
+    assert contents(tmp_path / "there") == contents(tmp_path / "here")
+
+
 def test_runs_whose_workers_are_killed_say_so(tmp_path, monkeypatch):
     """Without a cluster, whose five workers would take a minute."""
-    ray = pytest.importorskip("ray")
 
     def get(reference):
         raise ray.exceptions.WorkerCrashedError

@@ -14,21 +14,22 @@ from jbrep.evaluation import regression
 from jbrep.studies.runner import BACKENDS
 
 ROOT = Path(__file__).parent.parent
+SMALL = {"--evaluation-episodes": "1", "--set": "net_arch=[16]"}
+EPISODES = {"--evaluation-episodes": "1", "--final-episodes": "1"}
 LESS = {  # by command: numbers in place of a page's, or beside them
     "check": {"--steps": "1k"},
     "collect": {"--steps": "1k", "--episode-steps": "100"},
     "train-dae": {"--epochs": "2"},
     "train-encoder": {},
-    "rl": {"--steps": "200", "--evaluation-episodes": "1", "--episode-steps": "100"},
+    "rl": {"--steps": "200", "--episode-steps": "100", **EPISODES},
     "clone": {"--steps": "50", "--episodes": "2"},
-    "tune": {"--steps": "1100", "--trials": "1", "--evaluation-episodes": "1"},
     "render": {"--seconds": "0.5", "--size": "64x64"},
     "evaluate-policy": {"--episodes": "2"},
 }
 STUDY = {
     "seeds": "1",
     "steps": "100",
-    "evaluate_every": "50",
+    "evaluate_every": "100",
     "evaluation_episodes": "1",
     "final_episodes": "2",
 }
@@ -96,7 +97,7 @@ def test_ten_minutes_lead_from_a_robot_to_a_code(tmp_path, monkeypatch):
     monkeypatch.setattr(regression, "_STEPS", 100)
     monkeypatch.chdir(tmp_path)
     (study,) = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs/worth.md").read_text(), re.M | re.S)
-    for key, value in {**STUDY, "final_episodes": "2"}.items():
+    for key, value in STUDY.items():
         study = re.sub(rf"^{key} = .*\n", "", study, count=1, flags=re.M)
         study = f"{key} = {value}\n{study}"
     (tmp_path / "choice.toml").write_text(study.replace("steps = 20_000", "steps = 2_000"))

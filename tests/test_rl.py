@@ -5,7 +5,6 @@ import io
 import json
 import pickle
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -16,9 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command import wait_for
 from small import assert_same_files, forge
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
+from tensors import torch_threads
 
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
@@ -175,15 +176,11 @@ def test_training_starts_from_these_seeds_whatever_the_agent_seeds(tmp_path, mon
     assert [np.array_equal(start, expected) for start in starts if len(start) == 8] == [True]
 
 
-def test_neither_threads_nor_clock_nor_process_change_a_bit(short, tmp_path):
-    text = (
-        "import time, torch; from pathlib import Path; from jbrep.rl import Run, Session, train\n"
-        f"{IMPORTS}\n"
-        "torch.set_num_threads(2)\n"
-        "time.time = lambda: 1 << 33\n"  # zip files can't be dated after 2107
-        f"train({SHORT!r}, Path({str(tmp_path)!r}))"
-    )
-    subprocess.run([sys.executable, "-c", text], check=True)
+def test_neither_threads_nor_clock_change_a_bit(short, tmp_path, monkeypatch):
+    """Nor does the process: the next but one begins in another."""
+    with torch_threads(2), monkeypatch.context() as patch:
+        patch.setattr(time, "time", lambda: 1 << 33)  # zip files can't be dated after 2107
+        train(SHORT, tmp_path)
     assert_same_run(short, tmp_path)
 
 
@@ -198,29 +195,26 @@ def test_a_finished_run_is_left_alone(short):
 KILLED = Run.of(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK, preset="paper")
 
 
-def kill(run, folder, checkpoints=2):
-    """Train in another process; kill it when so many checkpoints have been written."""
+def test_a_killed_run_resumes_to_the_same_bits(tmp_path):
+    """Killed in a process of its own, when it has written two checkpoints."""
+    folder = tmp_path / "killed"
     text = (
         f"from pathlib import Path; from jbrep.rl import Run, Session, train; {IMPORTS};"
-        f"train({run!r}, Path({str(folder)!r}), Session(save_every=0.05))"
+        f"train({KILLED!r}, Path({str(folder)!r}), Session(save_every=0.05))"
     )
     process = subprocess.Popen([sys.executable, "-c", text], stderr=subprocess.PIPE, text=True)
     seen, path = set(), folder / "checkpoint.safetensors"
-    while process.poll() is None and len(seen) < checkpoints:
+
+    def written():
         if path.exists():
             seen.add(path.stat().st_mtime_ns)
-        time.sleep(0.005)
+        return len(seen) == 2
+
+    assert wait_for(written, process), process.communicate()
     process.kill()
-    error = process.communicate()[1]
-    return process.returncode, error[-2000:]
-
-
-def test_a_killed_run_resumes_to_the_same_bits(tmp_path):
-    run, folder = KILLED, tmp_path / "killed"
-    killed, error = kill(run, folder)
-    assert killed == -signal.SIGKILL, error
-    train(run, folder, Session(save_every=0.05))
-    train(run, tmp_path / "undisturbed")
+    process.communicate()
+    train(KILLED, folder, Session(save_every=0.05))
+    train(KILLED, tmp_path / "undisturbed")
     assert_same_run(tmp_path / "undisturbed", folder)
 
 

@@ -1,11 +1,9 @@
 """The data that a study's encoders are made from: several, by policies, made by several workers."""
 
-import hashlib
-import signal
+import pickle
 import tomllib
 
 import pytest
-from command import start, wait_for, wait_for_the_end_of, workers_of
 from test_study import TINY
 
 from jbrep.dataset import Dataset
@@ -18,24 +16,13 @@ from jbrep.studies.prepare import check, prepare
 
 TASK = "face_direction"
 MIXTURE = "uniform:0.4+heuristic:0.3+trained:0.3"
-DATA = {"apart": Data(steps=300), "mixed": Data(steps=600, policy=MIXTURE, seed=40)}
+DATA = {"apart": Data(steps=100), "mixed": Data(steps=100, policy=MIXTURE, seed=40)}
 CODES = (
     "full",
     {"name": "pca-4", "data": "apart"},
     {"name": "late", "kind": "pca", "latent": 4, "data": "mixed", "encoders": 2},
 )
-STUDY = TINY.replace(
-    tasks=(TASK, "move_in_direction"), representations=CODES, data=DATA, episode_steps=100
-)
-
-
-def digests(folder):
-    """What the files are that a study has made, as far as their bytes are its settings' alone."""
-    made = [*folder.rglob("shard-*"), *folder.rglob("*.safetensors")]
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in made
-    }
+STUDY = TINY.replace(tasks=(TASK, "move_in_direction"), representations=CODES, data=DATA)
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +51,22 @@ def test_representations_are_made_from_their_own_data(made):
             assert Dataset(made.data(task, number, table)).fingerprint == seen[name]
 
 
-def test_two_workers_make_the_same_bytes(made, tmp_path, capfd):
+@pytest.fixture
+def in_turn(monkeypatch):
+    """Workers that are no processes: test_study has some."""
+
+    def make(function, next_job, workers):
+        jobs = map(pickle.dumps, iter(next_job, None))
+        return ((job, function(job)) for job in map(pickle.loads, jobs))
+
+    monkeypatch.setattr("jbrep.studies.prepare.side_by_side", make)
+
+
+@pytest.mark.usefixtures("in_turn")
+def test_workers_say_what_they_make(tmp_path, capfd):
     plan = Plan(STUDY, tmp_path / "two")
     plan.write()
     prepare(plan, 2)
-    assert digests(plan.folder) == digests(made.folder)
     lines = capfd.readouterr().err.splitlines()
     assert "data.mixed of face_direction, set 1: encoder late-s1" in lines
     assert sum(line.endswith("states") for line in lines) == 6
@@ -76,37 +74,12 @@ def test_two_workers_make_the_same_bytes(made, tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_what_is_stopped_while_it_is_made_goes_on(tmp_path):
-    """To the same bytes: Ctrl-C reaches the workers, which keep what they have."""
-    study = TINY.replace(
-        representations=("full", {"name": "dae-2", "encoders": 2}),
-        data={"": Data(steps=4000)},
-        training={"epochs": 100},
-    )
-    (tmp_path / "it.toml").write_text(study.toml())
-    stopped, whole = Plan(study, tmp_path / "stopped"), Plan(study, tmp_path / "whole")
-    command = ("study", tmp_path / "it.toml", "--out", stopped.folder, "--workers", 2)
-    process = start(*command)
-    assert wait_for(lambda: list(stopped.folder.rglob("checkpoint.safetensors")), process, 400)
-    workers = workers_of(process.pid)
-    process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=120)
-    assert (process.returncode, "Traceback" in told) == (128 + signal.SIGINT, False), told
-    assert workers
-    wait_for_the_end_of(workers)
-    assert list(stopped.folder.rglob("checkpoint.safetensors"))
-    prepare(stopped, 2)
-    prepare(whole)
-    assert digests(stopped.folder) == digests(whole.folder)
-
-
-def test_a_mistake_of_a_worker_is_a_line(made, tmp_path):
+@pytest.mark.usefixtures("in_turn")
+def test_a_mistake_of_a_worker_is_a_line(tmp_path):
     plan = Plan(STUDY, tmp_path / "it")
-    plan.write()
-    for number in range(2):  # in the places of folders
-        path = plan.data(TASK, number, "mixed")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("")
+    path = plan.data(TASK, 0, "apart")
+    path.parent.mkdir(parents=True)
+    path.write_text("")  # in the place of a folder
     with pytest.raises(InputError) as error:
         prepare(plan, 2)
     assert "\n" not in str(error.value)
@@ -186,6 +159,6 @@ def test_named_data_may_come_later_but_not_change(made):
         ),
         made.folder,
     ).check_folder()
-    other = {**DATA, "mixed": Data(steps=601, policy=MIXTURE, seed=40)}
+    other = {**DATA, "mixed": Data(steps=101, policy=MIXTURE, seed=40)}
     with pytest.raises(InputError, match=r"another study: data\.mixed"):
         Plan(STUDY.replace(data=other), made.folder).check_folder()

@@ -10,7 +10,7 @@ import pytest
 from command import in_this_process, jbrep
 from judged import diagnostics, evaluation
 from my_encoders import LATENT, SIZE, FirstFeatures, dense
-from small import forge
+from small import ONE_EACH, forge
 from test_convert import model
 from test_study import TINY as TINY_STUDY
 
@@ -44,7 +44,7 @@ SHARED = {
     "preset": "paper",
     "steps": 80,
     "evaluate_every": 80,
-    "evaluation_episodes": 1,
+    **ONE_EACH,
 }
 TINY = TINY_STUDY.replace(representations=("full",), episode_steps=50)
 
@@ -130,7 +130,7 @@ def test_runs_with_an_encoder_each_stand_under_one_label(done):
         (name, (0, 1)) for name in ("full", "dense", "from-onnx", "mine", "net")
     ]
     record = json.loads((done.folder / RECORD).read_text())
-    mine, net = (record["labels"][f"{TASK}/a2c/{name}"] for name in ("mine", "net"))
+    mine, net = (record["labels"][f"{TASK}/a2c-paper/{name}"] for name in ("mine", "net"))
     assert mine["settings"]["encoder"] == EACH_ITS_OWN
     assert (mine["encoder"]["latent_size"], mine["encoder"]["metrics"]) == (8, {})
     assert (net["encoder"]["name"], net["encoder"]["latent_size"]) == (NET, LATENT)
@@ -276,7 +276,7 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     [
         (
             {"name": "m", "file": "encoders/{task}/m-{seed}.safetensors"},
-            rf"run {TASK}/a2c/m/seed-0 can't start: its encoder .*/{TASK}/m-0.safetensors is miss",
+            rf"run {TASK}/a2c-paper/m/seed-0 can't start: its encoder .*/{TASK}/m-0.safetensors is miss",
         ),
         ({"name": "m", "file": "pose.safetensors"}, f"made for move_to_pose, not for {TASK}"),
         ({"name": "m", "code": "other:Net"}, "importing other runs it; .* add --import other"),
@@ -320,7 +320,15 @@ def test_a_mistaken_representation_is_refused(given, field):
 def test_a_run_on_code(done, tmp_path, monkeypatch):
     out = tmp_path / "run"
     options = ("--task", TASK, "--episode-steps", 50, "--algorithm", "a2c", "--steps", 80)
-    options += ("--evaluate-every", 80, "--evaluation-episodes", 1, "--encoder")
+    options += (
+        "--evaluate-every",
+        80,
+        "--final-episodes",
+        1,
+        "--evaluation-episodes",
+        1,
+        "--encoder",
+    )
     told = jbrep("rl", *options, NET, "--out", out)
     assert told.exit_code == 0, told.output
     assert f"encoder: {NET}, code" in told.stdout

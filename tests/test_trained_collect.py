@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from command import jbrep
-from small import contents, settings
+from small import ONE_EACH, contents, settings
 
 from jbrep.collecting import collect
 from jbrep.collecting.backends import make_episodes
@@ -46,7 +46,7 @@ def runs(tmp_path_factory):
             for each in path.parent.glob("*.safetensors"):
                 shutil.copy(each, under_way)
 
-    usual = {"preset": "paper", "evaluation_episodes": 1, "evaluate_every": 80}
+    usual = {"preset": "paper", "evaluate_every": 80, **ONE_EACH}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(container, "write", keep)
         train(

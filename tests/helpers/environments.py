@@ -2,7 +2,6 @@
 
 import os
 import signal
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -72,24 +71,15 @@ class Broken(Sledge):
 
 
 class Deadly(Sledge):
-    """A sledge that takes its process along in an episode, the first so many times.
+    """A sledge that takes its process along in the episode with a seed."""
 
-    Args:
-        log: a file that has a letter for each time.
-        seed: of the episode.
-        times: how many.
-    """
-
-    def __init__(self, log="", seed=0, times=1):
+    def __init__(self, seed=0):
         super().__init__()
-        self.log, self.deadly, self.times = Path(log), seed, times
+        self.deadly = seed
 
     def reset(self, *, seed=None, options=None):
         if seed == self.deadly:
-            with self.log.open("a") as file:
-                file.write("x")
-            if len(self.log.read_text()) <= self.times:
-                os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGKILL)
         return super().reset(seed=seed)
 
 

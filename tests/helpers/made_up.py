@@ -25,6 +25,7 @@ from jbrep.studies.config import as_study
 from jbrep.studies.plan import Plan
 
 COMMITS = {"jbrep": "1" * 40}
+VERSIONS = packages()
 STILL = 250
 # what runs of each representation end with on average, with what SD, and when they come to half
 TRUTH = {"full": (850, 25, 5000), "dae-8": (848, 5, 3500), "pca-8": (500, 40, 6000)}
@@ -124,7 +125,7 @@ def write_record(folder, run, reason=None, **changes):
     """The run.json of a run that has ended as planned, or failed for a reason."""
     encoder = find(run.encoder, run.task)
     facts = {"latent_size": encoder.latent_size, "steps": run.steps, "seconds": 60.0}
-    facts |= {"versions": packages(), "commits": COMMITS, "cpu": "a processor"}
+    facts |= {"versions": VERSIONS, "commits": COMMITS, "cpu": "a processor"}
     facts["tables"] = {EVALUATIONS: "0" * 64}
     RunRecord(
         status=FINISHED if reason is None else FAILED,

@@ -36,7 +36,7 @@ environment_versions(PENDULUM)  # or every fork looks through the files of all p
 SHORT = ("--task", "Pendulum-v1", "--episode-steps", 20, "--steps", 40, "--evaluation-episodes", 1)
 TINY = Study(
     tasks=("face_direction",),
-    algorithms=("a2c",),
+    algorithms=("a2c-paper",),
     representations=("full",),
     seeds=(0, 1),
     steps=40,
