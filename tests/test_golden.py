@@ -108,7 +108,7 @@ def test_what_encoders_keep(folder):
         assert found[name]["sha256"] == encoder.fingerprint
         error = encoder.header.metrics["held_out_mse"]
         assert found[name]["reconstruction"]["mse"][0] == pytest.approx(error, rel=1e-3)
-    full, dae, pca = found["full"], found["dae-8"], found["pca-4"]
+    dae, pca = found["dae-8"], found["pca-4"]
     assert pca["reconstruction"]["mse"][0] == pytest.approx(0.111241, rel=1e-3)
     assert pca["reconstruction"]["ratio_to_pca"][0] == pytest.approx(1, rel=1e-6)
     assert dae["reconstruction"]["mse"][0] == pytest.approx(0.229057, rel=0.02)
