@@ -211,8 +211,8 @@ def collect(
     folder, known = Path(out), as_task(task)
     if not known.reproducible:
         _note(
-            f"{known.name} is not reproducible: no episode can be simulated again, to verify or to "
-            "repair the data set"
+            f"{known.name} is not reproducible: no episode can be simulated again to verify the "
+            "data set"
         )
     actor = find_policy(policy, folder, known)
     settings = DataSettings(

@@ -1,4 +1,4 @@
-"""Data sets of any environment: in processes, killed and resumed, verified, repaired, read."""
+"""Data sets of any environment: in processes, killed and resumed, verified, read."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ from small import contents, settings
 from jbrep.collecting import backends, collect
 from jbrep.collecting.derive import derive
 from jbrep.collecting.policies import Uniform
-from jbrep.collecting.replay import repair, replay_problems
+from jbrep.collecting.replay import replay_problems
 from jbrep.collecting.shards import Growth, Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export
@@ -136,18 +136,6 @@ def test_a_stopped_and_a_killed_collector_are_resumed(long, tmp_path, monkeypatc
     assert contents(data) == contents(long)
 
 
-def test_repair_restores_the_last_shard_and_others(sledges, tmp_path):
-    folder = tmp_path / "data"
-    collect(some(), folder, num_threads=1)
-    shards = sorted(folder.glob("*.h5"))
-    assert Dataset(folder).manifest.shards[-1].episodes < 5
-    shards[-1].unlink()
-    shards[1].write_bytes(b"spoiled")
-    assert [line.split()[-1] for line in repair(folder)] == ["restored", "restored"]
-    assert contents(folder) == contents(sledges)
-    assert not list(repair(folder))
-
-
 def test_an_environment_that_fails_ends_the_command_in_one_line(tmp_path):
     """With its id, seed and step; the shards before are kept."""
     seed = episode_seed(SLEDGE, 0, 7)  # in the second shard
@@ -190,10 +178,6 @@ def test_a_data_set_of_what_is_not_reproducible_says_so(tmp_path):
     assert (told.exit_code, told.output.count("\n")) == (2, 1)
     assert f"can't be replayed: {env_id} is not reproducible" in told.output
     assert "note" in jbrep("data", "info", data).output
-    (data / "shard-00000.h5").unlink()
-    told = jbrep("data", "repair", data)
-    assert (told.exit_code, told.output.count("\n")) == (2, 1)
-    assert f"can't be restored: {env_id} is not reproducible" in told.output
 
 
 def test_arrays_of_states_are_stored_and_compared(tmp_path):

@@ -13,7 +13,7 @@ from small import contents, settings, write_again, written
 
 from jbrep.collecting import collect, write_shards
 from jbrep.collecting.derive import derive
-from jbrep.collecting.replay import repair, replay_problems
+from jbrep.collecting.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.manifest import find_problems, open_shard, read_manifest
 from jbrep.dataset.schema import episode_seed
@@ -113,10 +113,6 @@ def test_an_episode_ends_where_its_physics_goes_non_finite(tmp_path, brief):
     with pytest.raises(InputError, match=r"the physics diverged in .*: run jbrep collect --task"):
         derive(dataset.folder, "move_to_pose", tmp_path / "derived")
     assert not (tmp_path / "derived").exists()
-    before = contents(dataset.folder)
-    (dataset.folder / "shard-00000.h5").unlink()
-    assert list(repair(dataset.folder, lanes=3))
-    assert contents(dataset.folder) == before
 
 
 def test_kills_lose_at_most_the_open_shard(tmp_path):

@@ -1,15 +1,15 @@
-"""Replaying, repairing and deriving data sets."""
+"""Replaying and deriving data sets."""
 
 import numpy as np
 import pytest
 import small
-from small import contents, flip_bit, settings, written
+from small import contents, settings, written
 
 from jbrep.collecting import collect
 from jbrep.collecting.derive import derive
-from jbrep.collecting.replay import repair, replay_problems
-from jbrep.dataset import DamageError, Dataset
-from jbrep.dataset.manifest import MANIFEST, commit, open_shard, read_manifest, write_manifest
+from jbrep.collecting.replay import replay_problems
+from jbrep.dataset import Dataset
+from jbrep.dataset.manifest import commit, open_shard, read_manifest, write_manifest
 from jbrep.errors import InputError
 from jbrep.jitterbug import bodies, simulation
 from jbrep.jitterbug.tasks import TASKS
@@ -86,31 +86,6 @@ def test_what_can_t_be_derived(collected, copied, tmp_path):
     with pytest.raises(InputError, match="is unfinished"):
         derive(copied, "move_to_pose", tmp_path / "x")
     assert not (tmp_path / "x").exists()
-
-
-def test_repair_makes_everything_again_as_it_was(copied, collected):
-    (copied / "shard-00001.h5").unlink()
-    flip_bit(copied / "shard-00003.h5", 56_000)
-    (copied / "shard-00004.h5").rename(copied / "shard-00000.h5")
-    told = list(repair(copied, lanes=3, num_threads=1))
-    assert [line.split("/")[-1] for line in told] == [
-        f"shard-0000{shard}.h5 restored" for shard in (0, 1, 3, 4)
-    ]
-    assert contents(copied) == contents(collected)
-
-
-def test_what_can_t_be_repaired(copied, tmp_path):
-    manifest = read_manifest(copied)
-    entry = manifest.shards[2].replace(sha256=64 * "0")  # of another machine, say
-    shards = (*manifest.shards[:2], entry, *manifest.shards[3:])
-    write_manifest(copied, manifest.replace(shards=shards))
-    (copied / "shard-00002.h5").unlink()
-    with pytest.raises(InputError, match=r"00002\.h5 can't be restored here.*'mujoco'"):
-        list(repair(copied))
-    assert not (copied / "shard-00002.h5").exists()
-    (copied / MANIFEST).write_bytes(b"{}")
-    with pytest.raises(DamageError, match=MANIFEST):
-        list(repair(copied))
 
 
 def test_other_versions_are_not_passed_off_as_these(copied, tmp_path):

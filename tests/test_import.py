@@ -22,7 +22,7 @@ from small import flip_bit, settings
 
 from jbrep.collecting import collect
 from jbrep.collecting.derive import derive_view
-from jbrep.collecting.replay import repair, replay_problems
+from jbrep.collecting.replay import replay_problems
 from jbrep.dataset import Dataset, from_arrays
 from jbrep.dataset.formats import FORMATS, export, open_sources
 from jbrep.dataset.formats.writer import write
@@ -492,5 +492,3 @@ def test_damage_is_noticed_and_nothing_is_simulated_again(written, tmp_path):
         list(replay_problems(Dataset(folder), 1))
     flip_bit(shard_path(folder, 0), -8)
     assert len(list(find_problems(folder))) == 1
-    with pytest.raises(InputError, match=r"import their source, pushes of a pole"):
-        list(repair(folder))

@@ -1,7 +1,7 @@
 """The representation to begin with, and the features file that says what was found."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +16,6 @@ from jbrep.envs.task import Feature, Task
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError
 from jbrep.records.document import toml_text
-from jbrep.text import words
 
 _USUAL = 0.01, 0.99  # quantiles of what was seen: a usual range, where none is known
 
@@ -34,24 +33,22 @@ def advise(
     seen: Seen,
     shapes: Shapes,
     findings: Sequence[Finding],
-    joints: Mapping[str, str],
     is_symmetric: bool,
     where: Path | None,
     data: Path | None,
 ) -> Advice:
     """Choose a representation for what was found, and write its command.
 
-    Features are called after joints, their file stands `where`, `data` is the folder that was read.
+    Their file stands `where`, `data` is the folder that was read.
     """
-    task, features = seen.task, _found(seen, shapes, joints)
+    task, features = seen.task, _found(seen, shapes)
     kinds = [[(each.kind, each.frame) for each in some] for some in (features, task.whole.features)]
     use_file = bool(where or kinds[0] != kinds[1] or any(e.kind == "scales" for e in findings))
     known = task.whole.replace(features=features) if use_file else task.whole
-    names = dict(zip(task.whole.feature_names, known.feature_names, strict=True))
-    hidden = [names[name] for name in (task.view.hidden if task.view else ())]
+    hidden = [*(task.view.hidden if task.view else ())]
     for each in findings:
         if each.kind == "world" and not is_symmetric:
-            hidden += [names[name] for name in each.features if name in names]
+            hidden += [name for name in each.features if name in task.whole.feature_names]
     steps = [each.numbers["history"] for each in findings if "history" in each.numbers]
     history = max([*steps, task.view.history if task.view else 1])
     system, why = ("symmetry", "turning and shifting it was tried: nothing else changes")
@@ -90,17 +87,16 @@ def _system(task: Task) -> tuple[str, str]:
     return "full", "no feature is known to jump"
 
 
-def _found(seen: Seen, shapes: Shapes, joints: Mapping[str, str]) -> tuple[Feature, ...]:
+def _found(seen: Seen, shapes: Shapes) -> tuple[Feature, ...]:
     """All features that the environment gives, with what was found of those that are seen."""
     task, before = seen.task, ""
-    renamed = words(joints.get(name, name) for name in task.whole.feature_names)
     places = {name: i for i, name in enumerate(task.feature_names)}
     turned = [first for first in shapes.quaternions if task.features[first].kind == "scalar"]
     made, parts = list[Feature](), dict[str, int]()
-    for old, name in zip(task.whole.features, renamed, strict=True):
+    for old in task.whole.features:
         i = places.get(old.name, -1)
         first = next((first for first in turned if first <= i < first + 4), None)
-        new = old.replace(name=name) if i < 0 else _as_seen(old.replace(name=name), seen, shapes, i)
+        new = old if i < 0 else _as_seen(old, seen, shapes, i)
         group = old.group if first is None else f"attitude{first}"
         if first is not None:
             new = new.replace(kind="quaternion", low=-1.0, high=1.0, bounded=True)
@@ -132,6 +128,5 @@ def features_toml(task: Task, features: Sequence[Feature], findings: Sequence[Fi
     for old, new in zip(task.whole.features, features, strict=True):
         told = [f"# {each.kind}: {each.evidence}" for each in findings if old.name in each.features]
         said = {key: value for key, value in asdict(new).items() if value not in (None, "", False)}
-        lines += ["", *([f"# {old.name}"] if old.name != new.name else []), *told]
-        lines += ["[[features]]", toml_text({"unit": "", **said}).rstrip()]
+        lines += ["", *told, "[[features]]", toml_text({"unit": "", **said}).rstrip()]
     return "\n".join(lines) + "\n"

@@ -160,8 +160,7 @@ def _check(
         fix = "draw everything from self.np_random, and reset all that an episode changes"
         findings.append(Finding("random", (), why, fix))
     findings.sort(key=lambda each: [*WORST_FIRST].index(each.kind))
-    joints = played.joints if played else {}
-    advice = advise(seen, known, findings, joints, is_symmetric, where, data)
+    advice = advise(seen, known, findings, is_symmetric, where, data)
     return Check(source, findings, advice, notes, seen, known, played)
 
 

@@ -1,6 +1,7 @@
 """What predicts what, judged on held-out episodes: what is missing, and what isn't needed."""
 
 from functools import cached_property
+from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from jbrep.dataset.scaled import sample
 from jbrep.envs.task import Array
 from jbrep.evaluation.evaluation import Score
 from jbrep.evaluation.held_out import explained
-from jbrep.evaluation.regression import Predictor, Problem, fit
+from jbrep.evaluation.regression import Predictor, Problem, beside, fit
 from jbrep.stats.bootstrap import by_episode
 from jbrep.text import counted
 
@@ -114,17 +115,23 @@ class Relations:
     # regressions
 
     def _fit(self, *problems: tuple[Array, Array]) -> list[Predictor]:
-        """Ridge regressions, and networks of what these leave, of the rows to fit."""
+        """Ridge regressions, and networks of what these leave, the last column's its own."""
         from sklearn.linear_model import Ridge  # not at the top: it takes seconds
         from sklearn.pipeline import make_pipeline
         from sklearn.preprocessing import StandardScaler
 
         rows = [(given[self._train], wanted[self._train]) for given, wanted in problems]
         lines = [make_pipeline(StandardScaler(), Ridge()).fit(x, y).predict for x, y in rows]
-        left = [Problem(x, y - line(x)) for (x, y), line in zip(rows, lines, strict=True)]
+        left = [y - line(x) for (x, y), line in zip(rows, lines, strict=True)]
+        parts = [np.hsplit(each, [-1]) if each.shape[1] > 1 else [each] for each in left]
+        problems_of = [
+            [Problem(x, y) for y in own] for (x, _), own in zip(rows, parts, strict=True)
+        ]
+        networks = iter(fit([*chain(*problems_of)]))
+        rests = [beside(*islice(networks, len(own))) for own in parts]
         return [
             lambda x, line=line, rest=rest: line(x) + rest(x)  # type: ignore[misc]
-            for line, rest in zip(lines, fit(left), strict=True)
+            for line, rest in zip(lines, rests, strict=True)
         ]
 
     @cached_property
@@ -165,7 +172,7 @@ class Relations:
             return Finding("sparse", (), why, fix, {"share": share})
         whole, alone = (self._r2(self._told(name), wanted)[-1] for name in ("now", "action"))
         numbers = {"r2": whole, "r2_of_action": alone}
-        if whole < _HARDLY or (alone > _MOSTLY and whole - alone < _SPARE):
+        if whole < _HARDLY or (alone > _KNOWN and whole - alone < _SPARE):
             why = f"observation and action predict its rank with an R² of {whole:.2f}, "
             why += f"the action alone with {alone:.2f}"
             fix = "reward what the robot should do, and show what that depends on"

@@ -4,15 +4,13 @@ import time
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.collecting.policies import Constant, OrnsteinUhlenbeck, Policy, Still, Uniform
 from jbrep.dataset import Dataset
 from jbrep.envs.lanes import lanes_at_once
-from jbrep.envs.physics import Motion, MotionReader
-from jbrep.envs.recording import held, read_nothing, record
+from jbrep.envs.recording import held, record
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 from jbrep.progress import Progress
@@ -29,9 +27,6 @@ POLICIES: dict[str, tuple[Policy, int]] = {  # with the steps for which each act
 }
 _FEWEST, _MOST = 4, 200  # episodes of a policy
 _AT_ONCE, _SHORTEST = 8, 20  # environments; steps to which an episode may be cut
-_SAME, _MOST_ROWS = 1e-6, 0.9  # relative difference of a feature and a joint; the share alike
-_PLACES, _SPEEDS = ("x", "y", "z", "qw", "qx", "qy", "qz"), ("vx", "vy", "vz", "wx", "wy", "wz")
-_FIRST_AXIS = {int(mujoco.mjtJoint.mjJNT_FREE): 0, int(mujoco.mjtJoint.mjJNT_BALL): 3}
 _Columns = tuple[NDArray[Any], ...]
 
 
@@ -55,7 +50,6 @@ class Played(NamedTuple):
     returns: dict[str, Array]  # of each policy's episodes
     limit: int  # steps to which these were cut
     rate: float  # steps a second
-    joints: dict[str, str]  # what features that are numbered only are called in MuJoCo's model
 
 
 def play(task: Task, steps: int, seed: int) -> tuple[Seen, Played]:
@@ -64,7 +58,7 @@ def play(task: Task, steps: int, seed: int) -> tuple[Seen, Played]:
     limit = min(task.max_episode_steps, max(_SHORTEST, share // _FEWEST))
     cut = task.replace(max_episode_steps=limit)
     at_once = min(_AT_ONCE, max(_FEWEST, share // limit)) if task.reproducible else 1
-    episodes, returns, joints, seconds = list[_Columns](), dict[str, Array](), dict[str, str](), 0.0
+    episodes, returns, seconds = list[_Columns](), dict[str, Array](), 0.0
     with (
         lanes_at_once(cut, at_once, None, 0) as lanes,
         Progress(total=steps, unit="step", unit_scale=True, leave=False, delay=1) as bar,
@@ -74,14 +68,9 @@ def play(task: Task, steps: int, seed: int) -> tuple[Seen, Played]:
             while len(own) < _FEWEST or (sum(map(len, own)) < share and len(own) < _MOST):
                 seeds = range(first, first := first + lanes.num_lanes)
                 lanes.reset(range(lanes.num_lanes), seeds)
-                act, reader = policy.begin(task.replace(timestep=1.0), seeds), MotionReader()
-                began = time.perf_counter()
-                reads = read_nothing if episodes else reader
-                made = record(lanes, held(act, repeat), bar.update, reads)
+                act, began = policy.begin(task.replace(timestep=1.0), seeds), time.perf_counter()
+                made = record(lanes, held(act, repeat), bar.update)
                 seconds += time.perf_counter() - began
-                if not episodes:
-                    motion = reader.motion(made, 0, int(made.length[0]))
-                    joints = _joints(task, made.observation[:, 0], motion)
                 for lane, n in enumerate(made.length.tolist()):
                     rows, action = made.observation[: n + 1, lane], made.action[:n, lane]
                     own.append(made.reward[:n, lane].astype(np.float64))
@@ -89,7 +78,7 @@ def play(task: Task, steps: int, seed: int) -> tuple[Seen, Played]:
                     episodes.append(_columns(len(episodes), rows, action, own[-1], ended, name))
             returns[name] = np.array([each.sum() for each in own])
     seen = _joined(task, episodes)
-    return seen, Played(returns, limit, len(seen.reward) / seconds, joints)
+    return seen, Played(returns, limit, len(seen.reward) / seconds)
 
 
 def read(data: Dataset, steps: int, seed: int) -> Seen:
@@ -132,22 +121,3 @@ def _columns(
 
 def _joined(task: Task, episodes: Iterable[_Columns]) -> Seen:
     return Seen(task, *map(np.concatenate, zip(*episodes, strict=True)))
-
-
-def _joints(task: Task, rows: NDArray[np.float32], motion: Motion | None) -> dict[str, str]:
-    """The joints that numbered features are, where each equals one number of MuJoCo's state."""
-    places, speeds, found = list[str](), list[str](), dict[str, str]()
-    if not motion:
-        return found
-    for joint in range(motion.model.njnt):
-        name = motion.model.joint(joint).name or f"joint{joint}"
-        first = _FIRST_AXIS.get(int(motion.model.jnt_type[joint]), len(_PLACES))
-        places += [f"{name}_{axis}" for axis in _PLACES[first:]] or [name]
-        speeds += [f"{name}_{axis}" for axis in _SPEEDS[first:]] or [f"{name}_velocity"]
-    states = np.hstack((motion.qpos, motion.qvel))
-    for feature, column in zip(task.feature_names, rows[: len(states)].T, strict=True):
-        near = np.abs(states - column[:, None]) <= _SAME * np.abs(column).max()
-        alike = np.flatnonzero(near.mean(axis=0) >= _MOST_ROWS)
-        if feature.startswith("obs_") and len(alike) == 1 and np.ptp(column):
-            found[feature] = (*places, *speeds)[alike[0]]
-    return found

@@ -27,7 +27,7 @@ _ORDER = (  # of work
     *("study", "report", "inspect", "render", "doctor"),
 )
 _GROUPS = {
-    "data": "Inspect, repair, derive, import and export data sets.",
+    "data": "Inspect, derive, import and export data sets.",
     "encoder": "Look at encoders, export and import them.",
     "policy": "Export a trained policy for a robot.",
 }

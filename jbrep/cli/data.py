@@ -13,7 +13,7 @@ from jbrep.cli.signals import stoppable
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.settings import StoreState
 from jbrep.errors import InputError
-from jbrep.parameters import AsJson, Hide, History, Lanes, Out, TaskName, Threads, described
+from jbrep.parameters import AsJson, Hide, History, Out, TaskName, Threads, described
 from jbrep.text import counted, terminal_width
 
 
@@ -123,18 +123,6 @@ def _say_all(lines: Iterable[str]) -> bool:
         say(line)
         any_said = True
     return any_said
-
-
-@command("data repair data/face")
-def repair(data: Path, /, *, lanes: Lanes = 100, threads: Threads = None) -> None:
-    """Make damaged and missing shards again from their seeds."""
-    from jbrep.collecting.replay import repair as run
-    from jbrep.play.sources import kept_policy
-
-    with stoppable(RESUMES):
-        repaired = _say_all(run(data, lanes, threads, kept_policy(data)))
-    if not repaired:
-        say(f"{data} is whole: nothing to repair")
 
 
 @command("data derive data/face --task move_in_direction --out data/move")

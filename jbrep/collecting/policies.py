@@ -12,7 +12,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from jbrep.dataset.schema import episode_part
-from jbrep.dataset.settings import MIXTURE, TRAINED, parts_of
+from jbrep.dataset.settings import MIXTURE, parts_of
 from jbrep.envs.names import code_named, digest_of, is_code, with_digest
 from jbrep.envs.recording import Actor as Actor
 from jbrep.envs.recording import open_loop
@@ -322,19 +322,10 @@ def acts_on_observations(settings: Mapping[str, Any]) -> bool:
     return not all(kind in POLICIES and POLICIES[kind].open_loop for kind in kinds)
 
 
-def make_policy(
-    settings: Mapping[str, Any], trained: Callable[[Mapping[str, Any]], Policy] | None = None
-) -> Policy:
-    """Make a policy from its settings, as in a manifest; those of runs need more than these."""
-    if trained and settings["kind"] == TRAINED:
-        return trained(settings)
-    if settings["kind"] == Own.kind:
-        own = Own.named(settings["name"].partition(" ")[0])
-        if own.settings() != settings:
-            raise InputError(f"the policy {settings['name']} has changed: it is {own.name} now")
-        return own
+def make_policy(settings: Mapping[str, Any]) -> Policy:
+    """Make a policy from its kind and constants, as in a manifest."""
     if settings["kind"] == MIXTURE:
-        return Mixture(tuple((w, make_policy(part, trained)) for w, part in settings["parts"]))
+        return Mixture(tuple((w, make_policy(part)) for w, part in settings["parts"]))
     constants = {name: value for name, value in settings.items() if name != "kind"}
     return _make(settings["kind"], constants)
 

@@ -1,31 +1,22 @@
-"""Playing stored episodes again, from their seeds and actions, and making damaged shards again."""
+"""Playing stored episodes again, from their seeds and actions."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain, repeat
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collecting.policies import Policy, make_policy
-from jbrep.collecting.shards import LANES, Simulator
+from jbrep.collecting.shards import LANES
 from jbrep.dataset import Dataset, DataSettings, Episode
 from jbrep.dataset.manifest import (
     Manifest,
-    open_shard,
-    policy_files,
-    read_manifest,
-    shard_image,
-    shard_path,
 )
-from jbrep.dataset.schema import joined
-from jbrep.envs.lanes import Lanes, check_counts
+from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Read, Recording, Tick, open_loop, read_nothing, read_states, record
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import InputError
 from jbrep.progress import Progress
-from jbrep.records.storage import exclusive, write_whole
 
 
 def replay_problems(
@@ -108,51 +99,3 @@ def _is_equal(recording: Recording, lane: int, episode: Episode) -> bool:
         column = f"initial_{name}" if name in episode.dataset.task.state else name
         pairs.append((values[lane], stored[column]))
     return all(a.dtype == b.dtype and a.tobytes() == b.tobytes() for a, b in pairs)
-
-
-def repair(
-    folder: Path,
-    lanes: int = LANES,
-    num_threads: int | None = None,
-    make: Callable[[Mapping[str, Any]], Policy] = make_policy,
-) -> Iterator[str]:
-    """Make damaged and missing shards again from their seeds; yields a line for each.
-
-    The policy is made from what the manifest says of it.
-    """
-    check_counts(lanes, num_threads)
-    read_manifest(folder)  # so that nothing is locked that isn't a data set
-    with exclusive(folder):
-        manifest = read_manifest(folder)
-        settings = manifest.settings
-        for shard in range(len(manifest.shards)):
-            try:
-                open_shard(folder, manifest, shard)
-            except DamageError:
-                path = shard_path(folder, shard)
-                reason = why_not_again(settings)
-                if settings.reward:
-                    reason = f"{settings.reward} gave the rewards; derive them again elsewhere"
-                if reason:
-                    raise InputError(f"{path} can't be restored: {reason}") from None
-                simulator = Simulator(settings, make(settings.policy), lanes, num_threads)
-                write_whole(path, _image(simulator, manifest, shard, path))
-                yield f"{path} restored"
-        policy_files(folder, manifest)
-
-
-def _image(simulator: Simulator, manifest: Manifest, shard: int, path: Path) -> bytes:
-    entry, task = manifest.shards[shard], manifest.task
-    first = shard * manifest.settings.shard_episodes
-    with Progress(total=entry.rows, unit="step", unit_scale=True, desc=path.name) as progress:
-        try:
-            episodes = range(first, first + entry.episodes)
-            blocks = [*simulator.made(episodes, progress.update)]
-        except InputError as error:
-            again = "; derive the data set again in another folder" if task.view else ""
-            raise InputError(f"{path} can't be restored: {error}{again}") from None
-    made, image = shard_image(manifest, shard, joined(blocks))
-    if made != entry:
-        why = why_otherwise(manifest)
-        raise InputError(f"{path} can't be restored here: it comes out differently; {why}")
-    return image

@@ -27,7 +27,7 @@ from jbrep.records.record import Record, Sha256, Version
 from jbrep.records.storage import exists, write_whole
 
 MANIFEST = "manifest.json"
-REPAIR = "run jbrep data repair to make it again"
+AGAIN = "collect or import the data again in another folder"
 _HASH = "sha256"  # of all else in the manifest
 _PACKAGES = ("jbrep", "mujoco", "numpy", "h5py")
 
@@ -161,10 +161,10 @@ def check_sizes(folder: Path, manifest: Manifest) -> None:
 
 def _check_size(path: Path, entry: Entry) -> None:
     if not exists(path):
-        raise DamageError(f"{path} is missing: {REPAIR}")
+        raise DamageError(f"{path} is missing: {AGAIN}")
     if (size := path.stat().st_size) != entry.bytes:
         raise DamageError(
-            f"{path} is damaged: it has {size:,} bytes instead of {entry.bytes:,}; {REPAIR}"
+            f"{path} is damaged: it has {size:,} bytes instead of {entry.bytes:,}; {AGAIN}"
         )
 
 
@@ -178,7 +178,7 @@ def open_shard(folder: Path, manifest: Manifest, shard: int, *, known: bool = Fa
     with refusing(f"can't read {path}", (OSError,)), path.open("rb") as file:
         content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     if not known and hashlib.sha256(content).hexdigest() != entry.sha256:
-        raise DamageError(f"{path} is damaged: its SHA-256 isn't the manifest's; {REPAIR}")
+        raise DamageError(f"{path} is damaged: its SHA-256 isn't the manifest's; {AGAIN}")
     columns = dict[str, NDArray[Any]]()
     for name, spec in manifest.settings.specs().items():
         shape = (entry.episodes if name.startswith(EPISODES) else entry.rows, *spec.row)

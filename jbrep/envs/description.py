@@ -266,7 +266,7 @@ def _facts(task: Task) -> Iterator[tuple[str, str]]:
     if task.reproducible:
         yield "reproducible", f"yes: {found} give the same bits"
     else:
-        lost = "data sets can't be repaired and stopped runs can't be resumed"
+        lost = "data sets can't be replayed and stopped runs can't be resumed"
         yield "reproducible", f"no: {found} differ, so {lost}"
 
 

@@ -1,7 +1,6 @@
 """What a user names: an episode of a data set, or a policy, of a run, a file or their own."""
 
 import hashlib
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +8,7 @@ import msgspec
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from jbrep.collecting.policies import POLICIES, Own, Policy, make_policy, parse_policy
+from jbrep.collecting.policies import POLICIES, Own, Policy, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import FULL
@@ -78,17 +77,6 @@ def find_policy(given: Any, folder: Path, task: Task) -> Policy:
         return found
 
     return parse_policy(str(given), frozen)
-
-
-def kept_policy(folder: Path) -> Callable[[Mapping[str, Any]], Policy]:
-    """How to make the policies of a data set in a folder from what its manifest says of them."""
-
-    def trained(settings: Mapping[str, Any]) -> Policy:
-        from jbrep.rl.policy import read_frozen  # imports torch
-
-        return read_frozen(folder, settings)
-
-    return lambda settings: make_policy(settings, trained)
 
 
 def is_trained(source: str) -> bool:

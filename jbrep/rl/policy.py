@@ -350,12 +350,3 @@ def kept(source: str, path: Path) -> Frozen | None:
 
 def _line(source: str) -> str:
     return printable(str(Path(source)))[-MAX_LETTERS:]
-
-
-def read_frozen(folder: Path, settings: Mapping[str, Any]) -> Frozen:
-    """The policy that a manifest names."""
-    path = folder / settings["file"]
-    frozen = Frozen(settings["file"], read_file(path))
-    if frozen.settings() != settings:
-        raise DamageError(f"{path} is damaged or another policy: its SHA-256 isn't in the manifest")
-    return frozen
