@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from msgspec import Meta
 
 from jbrep.errors import STEP_TIMEOUT, InputError
-from jbrep.records.storage import exists
 from jbrep.rl.presets import ALGORITHMS
 
 if TYPE_CHECKING:
@@ -145,6 +144,7 @@ def described(
     from jbrep.dataset.manifest import MANIFEST
     from jbrep.envs.description import describe
     from jbrep.envs.names import find_spec, name_given
+    from jbrep.records.storage import exists
 
     named = name_given(task)
     try:

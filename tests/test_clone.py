@@ -224,6 +224,7 @@ def test_a_clone_with_an_environment_plays_it_like_a_run(home, upright):
 def test_returns_of_other_rewards_are_not_compared(home, upright, monkeypatch):
     (home / "some_rewards.py").write_text("def one(seen, acts):\n    return 0 * seen[:, 0] + 1\n")
     monkeypatch.syspath_prepend(home)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
     import_modules(["some_rewards"])
     derive_view(upright.folder, home / "ones", reward="some_rewards:one")
     with pytest.warns(jbrep.errors.Notice, match="can't be compared"):

@@ -44,7 +44,7 @@ def _rl(
     return False
 
 
-@command("clone --data data/walk --encoder encoders/pca-2.safetensors --out runs/clone")
+@command("clone --data data/walk --method td3+bc --out runs/clone")
 def _clone(out: Path, **options: Annotated[Any, api.clone]) -> None:
     with stoppable(RESUMES):
         agent = api.clone(out=out, **options)
