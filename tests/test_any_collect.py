@@ -155,13 +155,13 @@ def test_an_environment_that_fails_ends_the_command_in_one_line(tmp_path):
 def test_a_shard_that_fails_doesn_t_matter_until_it_is_needed(tmp_path):
     """It was begun ahead of time; the one before it takes longer."""
 
-    arguments = {"seed": episode_seed(SLEDGE, 3, 300)}
+    arguments = {"seed": episode_seed(SLEDGE, 3, 100)}
     task = describe("Sledges/Broken-v0", arguments)
-    wide = some(task, steps=10**6, shard_episodes=300)
+    wide = some(task, steps=10**6, shard_episodes=100)
     growth = Growth(tmp_path, new_manifest(wide))
     shards = backends.local(Simulator(wide, Uniform(), 1, 2))(growth, lambda steps: None)
-    seeds = np.concatenate([next(shards)["episodes/seed"] for _ in range(300)])
-    np.testing.assert_array_equal(seeds, wide.seeds(np.arange(300)))
+    seeds = np.concatenate([next(shards)["episodes/seed"] for _ in range(100)])
+    np.testing.assert_array_equal(seeds, wide.seeds(np.arange(100)))
     with pytest.raises(InputError, match="Sledges/Broken-v0 failed at step 4"):
         next(shards)
 
