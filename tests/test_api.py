@@ -37,7 +37,7 @@ def test_from_states_to_a_policy(home):
     agent = jbrep.train(data.task, home / "run", algorithm="a2c", encoder=encoder, **QUICK)
     assert agent.returns.shape == (3,)
     assert repr(agent).startswith("Agent(a2c-modern on pca-4, face_direction: ")
-    assert repr(agent).endswith(f"median [10 %, 90 %] of 3 episodes; '{home}/run')")
+    assert repr(agent).endswith(f"mean and 95 % interval of 3 episodes; '{home}/run')")
     policy = jbrep.load_policy(home / "run")
     row = data["observation"][0]
     np.testing.assert_array_equal(policy(row), agent.policy(row))
@@ -45,8 +45,10 @@ def test_from_states_to_a_policy(home):
 
 def test_what_is_too_short_to_learn_or_not_to_be_written_is_told_first(home, tmp_path, monkeypatch):
     task = jbrep.Dataset(home / "data").task
-    with pytest.warns(Notice, match="sac-wide learns from step 25,600 on: 256 steps leave the pol"):
-        jbrep.train(task, tmp_path / "a", **QUICK | {"steps": 256, "evaluate_every": 256})
+    with pytest.warns(Notice, match="sac-modern learns from step 1,000 on: 256 steps leave"):
+        jbrep.train(
+            task, tmp_path / "a", **QUICK | {"steps": 256, "evaluate_every": 256}, preset="modern"
+        )
     monkeypatch.setattr("jbrep.play.sources.find_good_policy", None)  # plays thirty episodes
     (tmp_path / "junk").mkdir()
     (tmp_path / "junk/a.txt").touch()

@@ -150,8 +150,8 @@ def test_what_a_study_can_not_show_is_said_first(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"baseline is 'pca-9'"):
         TINY.replace(verdicts=Rules(baseline="pca-9"))
     assert "exploratory" in TINY.notices[0]
-    few = TINY.replace(algorithms=("sac-wide",), seeds=(0,)).notices
-    assert few[1].startswith("sac-wide learns from step 25,600 on: ")
+    few = TINY.replace(algorithms=("sac-modern",), seeds=(0,)).notices
+    assert few[1].startswith("sac-modern learns from step 1,000 on: ")
     path = written(tmp_path, 'representations = ["full"]')
     monkeypatch.setattr("jbrep.studies.forecast.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")

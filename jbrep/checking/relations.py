@@ -121,7 +121,8 @@ class Relations:
         from sklearn.preprocessing import StandardScaler
 
         rows = [(given[self._train], wanted[self._train]) for given, wanted in problems]
-        lines = [make_pipeline(StandardScaler(), Ridge()).fit(x, y).predict for x, y in rows]
+        models = [make_pipeline(StandardScaler(), Ridge()).fit(x, y) for x, y in rows]
+        lines = [lambda x, m=each: m.predict(x).reshape(len(x), -1) for each in models]
         left = [y - line(x) for (x, y), line in zip(rows, lines, strict=True)]
         parts = [np.hsplit(each, [-1]) if each.shape[1] > 1 else [each] for each in left]
         problems_of = [
