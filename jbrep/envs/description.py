@@ -48,7 +48,7 @@ def describe(
         arguments: of the environment, plain JSON; files that they name become absolute paths.
         max_episode_steps: the time limit [steps]; the registered one if not given.
         features: a TOML file with names, units, ranges, kinds and offsets, see
-            docs/environments.md.
+            docs/robot.md.
         missing: what becomes of readings that aren't finite, see `Task`; by default an error.
         hidden: what isn't seen of it, see `jbrep.envs.view.with_view`.
         history: states that are seen at once, see there.
