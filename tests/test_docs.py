@@ -107,11 +107,11 @@ SHARED = (
     ("page", "table"),
     [
         ("encoder-file", key_table(EncoderHeader)),
-        ("learning", key_table(TrainingSettings)),
+        ("keys", key_table(TrainingSettings)),
         ("logs", key_table(Layout)),
-        ("studies", key_table(Study, without=SHARED)),
-        ("studies", key_table(Data, of="data")),
-        ("studies", key_table(Rules, of="verdicts")),
+        ("keys", key_table(Study, without=SHARED)),
+        ("keys", key_table(Data, of="data")),
+        ("keys", key_table(Rules, of="verdicts")),
     ],
 )
 def test_the_tables_of_keys_are_those_of_the_records(page, table):
@@ -129,7 +129,8 @@ def test_the_commands_are_typed_as_they_are_understood(line, monkeypatch):
 
 
 def test_every_command_is_shown_and_every_command_shown_exists():
-    shown = set(re.findall(r"^ {4}jbrep ([a-z-]+)", (ROOT / "README.md").read_text(), re.M))
+    page = (ROOT / "docs/commands.md").read_text()
+    shown = set(re.findall(r"^ {4}jbrep ([a-z-]+)", page, re.M))
     assert shown == set(main.commands)
 
 

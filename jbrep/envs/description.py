@@ -50,7 +50,7 @@ def describe(
         env: arguments of the environment, plain JSON; files that they name become absolute paths.
         episode_steps: the time limit; the registered one if not given.
         features: a TOML file with names, units, ranges, kinds and offsets, see
-            docs/environments.md, or what it would hold.
+            docs/robot.md, or what it would hold.
         missing: what becomes of readings that aren't finite, see `Task`; by default an error.
         hide: what isn't seen of it, see `jbrep.envs.view.with_view`.
         history: states that are seen at once, see there.
