@@ -80,10 +80,8 @@ samples: $(READY) ## the sample data sets in data/, made anew
 	for task in $(TASKS); do \
 	  rm -rf data/sample/$$task; $(BIN)/jbrep collect --task $$task --steps 4k --out data/sample/$$task; done
 
-data: $(READY) ## data sets of five million states in data/, and one million of a cheetah: half an hour, 4 GB
-	$(BIN)/jbrep collect --task face_direction --steps 5M --store-state --out data/face_direction
-	for task in $(filter-out face_direction,$(TASKS)); do \
-	  $(BIN)/jbrep data derive data/face_direction --task $$task --out data/$$task || exit; done
+data: $(READY) ## data sets of five million states in data/, and one million of a cheetah: two hours, 4 GB
+	for task in $(TASKS); do $(BIN)/jbrep collect --task $$task --steps 5M --out data/$$task || exit; done
 	$(BIN)/jbrep collect --task dm_control/cheetah-run-v0 --steps 1M --out data/cheetah
 
 encoders: data ## results/encoders/ from these: hours; goes on where it was stopped
@@ -141,8 +139,8 @@ $(STUDIES): $(READY) $$(call column,1)
 encoders/ablation encoders/ablation-speed: encoders/%: $(READY)
 	$(BIN)/python tools/ablate.py $* $@
 data/unseen: $(READY)
-	$(BIN)/jbrep collect --task face_direction --steps 500k --seed 100 --store-state --out $@/face_direction
-	$(BIN)/jbrep data derive $@/face_direction --task move_in_direction --out $@/move_in_direction
+	for task in face_direction move_in_direction; do \
+	  $(BIN)/jbrep collect --task $$task --steps 500k --seed 100 --out $@/$$task || exit; done
 
 # what the answer rests on, in the order in which it runs
 PROGRAMME := $(shell sed -n 's/^\(\(answer\|identify\|size\|body\)-[a-z0-9-]*\) *;.*/\1/p' studies/judged.txt)

@@ -11,7 +11,6 @@ from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
 from small import contents, settings
 
 from jbrep.collecting import backends, collect
-from jbrep.collecting.derive import derive
 from jbrep.collecting.policies import Uniform
 from jbrep.collecting.replay import replay_problems
 from jbrep.collecting.shards import Growth, Simulator
@@ -190,8 +189,6 @@ def test_arrays_of_states_are_stored_and_compared(tmp_path):
     assert not episodes["initial_heat"].any()
     assert len(np.unique(episodes["colour"][:, 0])) == len(episodes["length"])
     assert not list(replay_problems(dataset, 2))
-    with pytest.raises(InputError, match="only the Jitterbug's tasks share"):
-        derive(tmp_path / "data", "face_direction", tmp_path / "derived")
     with pytest.raises(InputError, match=f"{ID} has no states to store"):
         some(store_state=True)
     for name in ("reward", "length", "policy", "final_heat"):

@@ -108,7 +108,7 @@ MISTAKES = {
     "collect --task fly --steps 1k --out x": "unknown task 'fly'",
     "env environments:Sledge": "Sledge has no time limit: give one with --episode-steps",
     "train-dae --data none --latent 8 --out x": "no data set in none",
-    "data derive none --task fly --out x": "no data set in none",
+    "data derive none --hide x --out x": "no data set in none",
     "data fly": "No such command 'fly'. See jbrep data --help.",
     "evaluate-policy none": "none is no data set, no run",
     "collect --task face_direction --steps 1 --policy sprint --out x": "unknown policy 'sprint'",
@@ -180,8 +180,8 @@ def test_a_data_set_from_collecting_to_exporting(tmp_path):
     told = jbrep("data", "verify", data, "--replay", 2)
     assert "no problems in 1,200 rows, 2 shards" in told.output
     assert "2 episodes simulated again: equal in every bit" in told.output
-    told = jbrep("data", "derive", data, "--task", "move_in_direction", "--out", derived)
-    assert "2 episodes of move_in_direction, 1,200 rows" in told.output
+    told = jbrep("data", "derive", data, "--history", 2, "--out", derived)
+    assert "1,200 rows" in told.output
     told = jbrep("data", "export", derived, "--to", "npz", "--out", tmp_path / "data.npz")
     assert f"open it with numpy.load('{tmp_path / 'data.npz'}')\n" in told.output
     (data / "shard-00001.h5").unlink()

@@ -13,7 +13,7 @@ from small import assert_same_files
 import jbrep
 from jbrep.cloning import clone as cloning
 from jbrep.cloning.objective import Seen
-from jbrep.collecting.derive import derive_view
+from jbrep.collecting.derive import derive
 from jbrep.dataset import Dataset, Layout, from_table
 from jbrep.encoders import find
 from jbrep.envs.names import import_modules
@@ -226,7 +226,7 @@ def test_returns_of_other_rewards_are_not_compared(home, upright, monkeypatch):
     monkeypatch.syspath_prepend(home)
     monkeypatch.setattr("jbrep.envs.names._imported", [])
     import_modules(["some_rewards"])
-    derive_view(upright.folder, home / "ones", reward="some_rewards:one")
+    derive(upright.folder, home / "ones", reward="some_rewards:one")
     with pytest.warns(jbrep.errors.Notice, match="can't be compared"):
         jbrep.clone(Dataset(home / "ones"), home / "other", steps=10, episodes=1)
 

@@ -2,15 +2,13 @@
 
 import os
 import shutil
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from small import brief, contents, write_again, written
+from small import brief, contents, write_again
 
 from jbrep.collecting import collect
-from jbrep.collecting.derive import derive
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, find_problems, read_manifest, write_manifest
 from jbrep.errors import InputError
@@ -34,23 +32,6 @@ def long(tmp_path_factory):
     folder = tmp_path_factory.mktemp("long") / "data"
     collect(two_by_two(500), folder)
     return folder
-
-
-def test_an_extended_data_set_is_the_one_collected_at_once(short, long, tmp_path):
-    folder = shutil.copytree(short, tmp_path / "data")
-    assert written(folder, lambda: collect(two_by_two(350), folder)) == [1]  # becomes a full one
-    assert written(folder, lambda: collect(two_by_two(400), folder)) == []
-    last = partial(collect, two_by_two(500), folder, lanes=1, num_threads=1)
-    assert written(folder, last) == [2]
-    assert contents(folder) == contents(long)
-    assert not list(find_problems(folder))
-
-
-def test_a_derived_data_set_is_extended_with_its_source(short, long, tmp_path):
-    derive(short, "move_to_pose", tmp_path / "data")
-    derive(long, "move_to_pose", tmp_path / "data")
-    derive(long, "move_to_pose", tmp_path / "at once")
-    assert contents(tmp_path / "data") == contents(tmp_path / "at once")
 
 
 class Kill(BaseException):

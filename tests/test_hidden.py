@@ -4,7 +4,7 @@ import pytest
 from command import jbrep, mistake
 
 from jbrep.collecting import collect
-from jbrep.collecting.derive import derive_view
+from jbrep.collecting.derive import derive
 from jbrep.dataset import Dataset, DataSettings, ScaledDataset
 from jbrep.envs import describe
 from jbrep.evaluation import diagnose, regression
@@ -26,8 +26,8 @@ def swing(tmp_path_factory):
     folder = tmp_path_factory.mktemp("swing")
     settings = DataSettings(task=describe("Pendulum-v1"), steps=6000, seed=2)
     collect(settings, folder / "whole", num_threads=1)
-    derive_view(folder / "whole", folder / "now", [SPEED])
-    derive_view(folder / "whole", folder / "history", [SPEED], 2)
+    derive(folder / "whole", folder / "now", [SPEED])
+    derive(folder / "whole", folder / "history", [SPEED], 2)
     return folder
 
 

@@ -21,7 +21,7 @@ from gymnasium import spaces
 from small import flip_bit, settings
 
 from jbrep.collecting import collect
-from jbrep.collecting.derive import derive_view
+from jbrep.collecting.derive import derive
 from jbrep.collecting.replay import replay_problems
 from jbrep.dataset import Dataset, from_arrays
 from jbrep.dataset.formats import FORMATS, export, open_sources
@@ -204,7 +204,7 @@ def test_an_episode_may_have_ended_in_both_ways(to, tmp_path):
 
 def test_what_is_hidden_goes_to_minari(collected, tmp_path):
     """Beside the whole; without the environment, which shows more."""
-    derive_view(collected, tmp_path / "seen", ["*velocity*"])
+    derive(collected, tmp_path / "seen", ["*velocity*"])
     seen = Dataset(tmp_path / "seen")
     export(Dataset(collected), "minari", tmp_path / "out")
     export(seen, "minari", tmp_path / "out")

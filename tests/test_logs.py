@@ -31,7 +31,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from jbrep.collecting import collect
-from jbrep.collecting.derive import derive_view
+from jbrep.collecting.derive import derive
 from jbrep.dataset import (
     Dataset,
     DataSettings,
@@ -192,11 +192,11 @@ def test_a_folder_holds_what_was_derived_from_one_import(tmp_path):
         table = {"x": sign * np.sin(rows), "y": rows, "u": np.cos(rows), "trial": rows // 20}
         path = write_csv(tmp_path / "log.csv", table)
         source[name] = imported(path, "--actions", "u", "--episode", "trial", out=name)[1].folder
-    derive_view(source["a"], derived, ["y"])
+    derive(source["a"], derived, ["y"])
     for other in "bc":
         with pytest.raises(InputError, match=str(source[other])):
-            derive_view(source[other], derived, ["y"])
-    derive_view(source["d"], derived, ["y"])
+            derive(source[other], derived, ["y"])
+    derive(source["d"], derived, ["y"])
     np.testing.assert_array_equal(Dataset(derived)["x"], Dataset(source["d"])["x"])
 
 

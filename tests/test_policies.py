@@ -11,7 +11,6 @@ from jbrep.collecting.policies import (
     OrnsteinUhlenbeck,
     Still,
     Uniform,
-    acts_on_observations,
     generators,
     make_policy,
     parse_policy,
@@ -168,8 +167,6 @@ def test_each_episode_of_a_mixture_has_one_of_its_policies():
         np.testing.assert_array_equal(actions[:, lane], alone[part][:, lane])
     np.testing.assert_array_equal(drives(MIXTURE, lanes=1, seed=7)[:3, 0], actions[:, 7])
     assert make_policy(MIXTURE.settings()) == MIXTURE
-    assert acts_on_observations(MIXTURE.settings())
-    assert not acts_on_observations(parse_policy("uniform:1+constant:1").settings())
 
 
 def test_what_chooses_an_episode_s_policy_is_drawn_from_nothing_else():

@@ -11,14 +11,12 @@ from small import ONE_EACH, contents, settings
 
 from jbrep.collecting import collect
 from jbrep.collecting.backends import make_episodes
-from jbrep.collecting.derive import derive
 from jbrep.collecting.shards import Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import find_problems
 from jbrep.dataset.schema import joined
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
-from jbrep.errors import InputError
 from jbrep.inspection.subject import _find
 from jbrep.play.sources import find_player, find_policy
 from jbrep.records import container
@@ -134,12 +132,10 @@ def test_a_data_set_keeps_the_policy_of_a_run_that_goes_on_or_is_gone(runs, tmp_
         np.testing.assert_array_equal(column, Dataset(tmp_path / "once").episodes[name])
 
 
-def test_it_is_verified_and_not_derived(data, tmp_path):
+def test_it_is_verified(data, tmp_path):
     folder = shutil.copytree(data, tmp_path / "data")
     told = jbrep("data", "verify", folder, "--replay", 3)
     assert told.exit_code == 0, told.output
-    with pytest.raises(InputError, match="was collected by a mixture policy, which acts on obs"):
-        derive(folder, "move_to_pose", tmp_path / "derived")
     (folder / POLICY).write_bytes(b"another")
     (problem,) = find_problems(folder)
     assert "policy-0.safetensors is damaged or missing: it is the policy of" in problem

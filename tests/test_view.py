@@ -8,7 +8,7 @@ from command import jbrep, mistake
 from test_controller import controller_of, difference_over_an_episode, randomised
 
 from jbrep.collecting import collect
-from jbrep.collecting.derive import derive_view
+from jbrep.collecting.derive import derive
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.envs import Lanes, describe
 from jbrep.envs.names import import_modules
@@ -89,7 +89,7 @@ def test_a_derived_data_set_is_as_if_it_were_collected(name, arguments, steps, m
     hidden = task.feature_names[1:2]
     settings = DataSettings(task=task, steps=300, shard_episodes=4)
     collect(settings, tmp_path / "whole", num_threads=1)
-    derive_view(tmp_path / "whole", tmp_path / "derived", hidden, 3)
+    derive(tmp_path / "whole", tmp_path / "derived", hidden, 3)
     collect(
         settings.replace(task=with_view(task, hidden, 3)), tmp_path / "collected", num_threads=1
     )

@@ -11,9 +11,8 @@ from jbrep import api
 from jbrep.cli.base import RESUMES, command, say, say_json
 from jbrep.cli.signals import stoppable
 from jbrep.dataset.layout import Layout
-from jbrep.dataset.settings import StoreState
 from jbrep.errors import InputError
-from jbrep.parameters import AsJson, Hide, History, Out, TaskName, Threads, described
+from jbrep.parameters import AsJson, Hide, History, Out, Threads, described
 from jbrep.text import counted, terminal_width
 
 
@@ -125,49 +124,34 @@ def _say_all(lines: Iterable[str]) -> bool:
     return any_said
 
 
-@command("data derive data/face --task move_in_direction --out data/move")
+@command("data derive data/face --hide 'velocity_*' --history 4 --out data/seen")
 def derive(
     data: Path,
     /,
     out: Out,
     *,
-    task: TaskName = None,
-    store_state: StoreState = False,
     hide: Hide = (),
     history: History = 1,
     reward: Annotated[str, Meta(extra={"metavar": "MODULE:FUNCTION", "is_code": True})] = "",
-    threads: Threads = None,
 ) -> None:
-    """Make another data set of the same motion.
+    """Make another data set of the same motion, with other rewards, or less or more to see.
 
-    It is of another task, has other rewards, or less or more to see. Another task's equals
-    collecting that task with the same settings, bit for bit, without simulating again; the source
-    needs its states (collect --store-state) and a policy that doesn't depend on observations. The
-    rest can be changed in any data set: `hide` leaves features out, `history` adds those of the
-    steps before, and the actions since: an encoder of these estimates what can't be measured.
-    `reward` is a function of your own, of what is seen before anything is hidden.
+    `hide` leaves features out, `history` adds those of the steps before, and the actions since: an
+    encoder of these estimates what can't be measured. `reward` is a function of your own, of what
+    is seen before anything is hidden.
 
     Args:
-        task: another of the Jitterbug's tasks to observe and reward.
         reward: for rewards (n,) of the observations (n, d) and actions (n, k) of an episode; is
             run.
     """
     from jbrep.collecting.derive import derive as run
-    from jbrep.collecting.derive import derive_view
     from jbrep.envs.names import is_code
 
-    if bool(task) == (bool(hide or reward) or history > 1):
-        raise InputError("give a --task, or else --hide, --history or --reward")
-    if store_state and not task:
-        raise InputError("--store-state is for --task: else states stay as the source has them")
-    if threads and not task:
-        raise InputError("--threads is for --task: nothing else is simulated")
+    if not (hide or reward or history > 1):
+        raise InputError("give --hide, --history or --reward")
     if reward and not is_code(reward):
         raise InputError(f"--reward {reward} must be MODULE:FUNCTION")
-    if task:
-        _report(out, lambda: run(data, task, out, store_state, threads))
-    else:
-        _report(out, lambda: derive_view(data, out, hide, history, reward))
+    _report(out, lambda: run(data, out, hide, history, reward))
 
 
 @command("data export data/face --to parquet --out face.parquet")

@@ -12,7 +12,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from jbrep.dataset.schema import episode_part
-from jbrep.dataset.settings import MIXTURE, parts_of
+from jbrep.dataset.settings import MIXTURE
 from jbrep.envs.names import code_named, digest_of, is_code, with_digest
 from jbrep.envs.recording import Actor as Actor
 from jbrep.envs.recording import open_loop
@@ -314,12 +314,6 @@ def _weight(text: str) -> float:
         f"the weight {text!r} must be a positive number below 1e12: each part of a mixture has "
         "one, as in uniform:0.8+heuristic:0.2"
     )
-
-
-def acts_on_observations(settings: Mapping[str, Any]) -> bool:
-    """Whether the policy of a manifest may act on what is observed."""
-    kinds = [part["kind"] for part in parts_of(settings)]
-    return not all(kind in POLICIES and POLICIES[kind].open_loop for kind in kinds)
 
 
 def make_policy(settings: Mapping[str, Any]) -> Policy:

@@ -32,9 +32,7 @@ ShardEpisodes = Annotated[
         },
     ),
 ]
-StoreState = Annotated[
-    bool, Meta(description="Store the Jitterbug's qpos and qvel, for jbrep data derive.")
-]
+StoreState = Annotated[bool, Meta(description="Store the Jitterbug's qpos and qvel, too.")]
 
 
 class CollectSettings(Record, frozen=True, kw_only=True):

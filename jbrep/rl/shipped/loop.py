@@ -25,6 +25,7 @@ class Policy:
         features, bounds = said["observation"], said["action"]
         self.names = [each["name"] for each in features]
         self.period, self._repeat = said["control_period"] or 0.01, said["action_repeat"]
+        self._chunk = np.zeros((said["chunk"], len(bounds["low"])))  # actions chosen at once
         low, high = (np.array([f[end] for f in features], float) for end in ("low", "high"))
         self._low, self._high = low - FAR * (high - low), high + FAR * (high - low)
         self._offset = np.array([each["offset"] for each in features])
@@ -32,7 +33,7 @@ class Policy:
         self._states: list[np.ndarray] = []  # the newest first, then so the actions between
         self._actions = [self.rest] * (said["history"] - 1)
         self._count, self._action = said["history"], self.rest
-        self._step, self._turn, self.held = -1, -1, 0
+        self._step, self._choice, self.held = -1, -1, 0
 
     def __call__(self, sensors: np.ndarray | None, step: int) -> np.ndarray | None:
         """The action at a control step; None once the sensors were missing for too long."""
@@ -49,10 +50,13 @@ class Policy:
             if self._states:
                 self._actions = [self._action, *self._actions][: self._count - 1]
             self._states = [now, *(self._states or [now] * self._count)][: self._count]
-        if step // self._repeat != self._turn:
-            self._turn = step // self._repeat
+        choice, part = divmod(step // self._repeat, len(self._chunk))
+        if choice != self._choice:
+            self._choice = choice
             seen = np.concatenate([*self._states, *self._actions])[None].astype(np.float32)
-            self._action = self._model.run(["action"], {"observation": seen})[0][0]
+            chosen = self._model.run(["action"], {"observation": seen})[0]
+            self._chunk = chosen.reshape(self._chunk.shape)
+        self._action = self._chunk[part]
         return self._action
 
 
