@@ -24,8 +24,8 @@ from jbrep.parameters import (
     Episodes,
     GivenDrawnTask,
     GivenTask,
-    Lanes,
     Normalize,
+    NumEnvs,
     OptionalGivenTask,
     Overrides,
     Preset,
@@ -178,7 +178,7 @@ def collect(
     seed: RootSeed = 0,
     store_state: StoreState = False,
     shard_episodes: ShardEpisodes | None = None,
-    lanes: Lanes = 100,
+    num_envs: NumEnvs = 100,
     threads: Threads = None,
     retries: Retries = 0,
     backend: Backend = "local",
@@ -186,10 +186,10 @@ def collect(
     """Collect the states that a policy visits.
 
     The same again resumes an unfinished data set and leaves a finished one as it is; with more
-    `steps` it extends it, to the data that as many at once give. The numbers of lanes and threads
-    and the backend don't change the data. A robot that exists once needs `threads` 1. Whole shards
-    are kept whatever happens. The policy of a run is kept with the data as it is at the start, also
-    if the run goes on.
+    `steps` it extends it, to the data that as many at once give. Neither the number of environments
+    or threads nor the backend changes the data. A robot that exists once needs `threads` 1. Whole
+    shards are kept whatever happens. The policy of a run is kept with the data as it is at the
+    start, also if the run goes on.
 
     Args:
         task: whose environment is played; how readings that are missing are treated belongs to it.
@@ -225,7 +225,7 @@ def collect(
         if part["kind"] == TRAINED and exists(folder / part["file"]):
             acts = f"{part['run']} acts as it did at step {part['step']:,}"
             _note(f"{acts}, which {folder / part['file']} keeps")
-    run(settings, folder, lanes, threads, backend, actor, retries)
+    run(settings, folder, num_envs, threads, backend, actor, retries)
     return Dataset(folder)
 
 
@@ -301,7 +301,7 @@ def evaluate(
         data: that they are judged on.
         out: a folder for evaluation.json; None to write nothing.
         policy: one that does the task well: a run's folder, or a policy by name; by default the
-            task's hand-written policy, if it has one.
+            task's scripted policy, if it has one.
         truth: the data set that `data` was derived from, with what it hides: how well an encoder
             estimates what isn't seen.
     """
@@ -537,7 +537,7 @@ def report(
     evaluation: Annotated[Sequence[str], Meta(extra={"metavar": "FOLDER"})] = (),
     out: str | Path | None = None,
 ) -> "Report":
-    """Say what a study found, and write a page of it.
+    """Summarise what a study found, and write a page of it.
 
     Args:
         folder: of a study, of runs, or of the tables of a study.

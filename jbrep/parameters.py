@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jbrep.envs.task import Task
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
-Lanes = Annotated[
+NumEnvs = Annotated[
     int, Meta(ge=1, le=100_000, description="Environments of a batch, stepped at once.")
 ]
 Threads = Annotated[

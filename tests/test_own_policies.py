@@ -76,7 +76,7 @@ def test_a_function_acts_within_the_bounds_alone_or_on_all(tmp_path):
     velocity = data["observation"][:].reshape(3, 20, 3)[..., 2]
     np.testing.assert_allclose(made, np.clip(3 * velocity, -2, 2), rtol=1e-6)
     assert (np.abs(made) == 2).any()
-    np.testing.assert_array_equal(actions(f"{HERE}:swing_all", tmp_path / "b", lanes=2)[0], made)
+    np.testing.assert_array_equal(actions(f"{HERE}:swing_all", tmp_path / "b", num_envs=2)[0], made)
 
 
 def test_what_is_remembered_begins_with_the_episode(tmp_path):

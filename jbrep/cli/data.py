@@ -18,7 +18,7 @@ from jbrep.text import counted, terminal_width
 
 @command("env Hopper-v5")
 def env(task: str, /, *, as_json: AsJson = False, **options: Annotated[Any, described]) -> None:
-    """Say what a task is.
+    """Show a task: its features, actions and time limit.
 
     Its features, actions and time limit, and whether it is reproducible. TASK is one of the
     Jitterbug's, such as face_direction, or an id in Gymnasium's registry; for another package's,

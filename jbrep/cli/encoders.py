@@ -35,7 +35,7 @@ def evaluate(
     as_json: AsJson = False,
     **options: Annotated[Any, api.evaluate],
 ) -> None:
-    """Show which encoders serve, and what each lacks.
+    """Show which encoders retain enough, and what each misses.
 
     Judged on the held-out episodes: how well they predict the state and the reward, what they say
     of a good policy's value and action, linear and nonlinear probes, reconstruction, the latent's

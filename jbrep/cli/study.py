@@ -33,7 +33,7 @@ def study(
     dry_run: bool = False,
     register: bool = False,
 ) -> bool:
-    """Train a grid of agents, and judge the claims of a study.
+    """Train a grid of agents, and test the claims of a study.
 
     STUDY is a TOML file of tasks, algorithms, representations and seeds, or demo, which ships.
     Tasks are the Jitterbug's, by their names, and any environments, by their Gymnasium ids.
@@ -132,7 +132,7 @@ def report(
     as_json: AsJson = False,
     **options: Annotated[Any, api.report],
 ) -> None:
-    """Say what a study found, and write a page of it.
+    """Summarise what a study found, and write a page of it.
 
     FOLDER holds a study, finished or not, or any runs. Where there are no runs, as in
     results/confirm, the report is made from the tables alone.

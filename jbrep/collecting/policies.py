@@ -138,7 +138,7 @@ class OrnsteinUhlenbeck(Constants, frozen=True):
 
 
 class Heuristic(Constants, frozen=True):
-    """The task's hand-written policy."""
+    """The task's scripted policy."""
 
     kind: ClassVar[str] = "heuristic"
     open_loop: ClassVar[bool] = False
@@ -146,7 +146,7 @@ class Heuristic(Constants, frozen=True):
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         if task.name not in HEURISTICS:
             raise InputError(
-                f"{task.name} has no hand-written policy: choose another policy than {self.kind}; "
+                f"{task.name} has no scripted policy: choose another policy than {self.kind}; "
                 f"those that have one are {', '.join(HEURISTICS)}"
             )
         return HEURISTICS[task.name]

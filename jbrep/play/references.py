@@ -1,4 +1,4 @@
-"""Policies that agents are compared with: some that don't look, and the hand-written ones."""
+"""Policies that agents are compared with: blind baselines, and the scripted ones."""
 
 from collections.abc import Sequence
 from contextlib import suppress

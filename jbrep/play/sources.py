@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jbrep.evaluation.control import GoodPolicy
     from jbrep.rl.policy import Trained
 
-_HEURISTIC = "heuristic"  # the Jitterbug's hand-written policy
+_HEURISTIC = "heuristic"  # the Jitterbug's scripted policy
 _GOOD_EPISODES = 30  # of a good policy
 
 
@@ -146,7 +146,7 @@ def _needed(task: Task | None, policy: str) -> Task:
 def find_good_policy(source: Any, task: Task, own_rewards: bool = False) -> "GoodPolicy | None":
     """A policy with the episodes that it plays: the first of those that runs are evaluated on.
 
-    Without a source it is the hand-written policy, if the task has one. Nothing is played where
+    Without a source it is the scripted policy, if the task has one. Nothing is played where
     rewards are others than the environment gives.
     """
     if source is None:

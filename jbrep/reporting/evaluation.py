@@ -1,4 +1,4 @@
-"""An evaluation of encoders to read on a screen: which code to take, and what each lacks."""
+"""An evaluation of encoders to read on a screen: the recommended one, and what each misses."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -21,19 +21,19 @@ _CHOSEN_BY = "rewarded"  # whose interval is shown
 
 
 class Judged(NamedTuple):
-    """Which codes should serve a controller."""
+    """Which encoders retain enough for a controller."""
 
     by: str  # what decides, in words
-    serving: Sequence[str] = ()  # the codes that should, the best first
-    take: str | None = None  # the smallest of these, if possible one that lacks nothing
-    nearest: str | None = None  # where none serves, the one that comes nearest, if one does
-    unsaid: str = ""  # why nothing can be said; empty where something can
+    enough: Sequence[str] = ()  # the encoders that do, the best first
+    recommended: str | None = None  # the smallest of these, if possible one that misses nothing
+    nearest: str | None = None  # where none does, the one that comes nearest, if one does
+    unknown: str = ""  # why nothing can be said; empty where something can
 
 
 def evaluation_text(
     evaluation: Evaluation, width: int | None = None, everything: bool = False
 ) -> str:
-    """Which code to take and what each lacks, in lines of that width; everything else if wanted."""
+    """What is recommended and what each misses, at most that wide; everything else if wanted."""
     parts = [*_parts(evaluation, width), *(_everything(evaluation, width) if everything else ())]
     return "\n\n".join(
         part.text(width) if isinstance(part, Table) else part for part in parts if part
@@ -45,11 +45,11 @@ def _parts(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
     yield wrapped(say("advice", judged), width)
     yield _headline(evaluation, judged)
     yield from _hidden(evaluation)
-    yield _lacks_text(evaluation, width)
+    yield _missed_text(evaluation, width)
 
 
 def judge(evaluation: Evaluation) -> Judged:
-    """By what can be predicted from each code, beside the best, the full observation among them."""
+    """By what each encoder predicts, compared with the best, the full observation among them."""
     horizon = evaluation.encoders[FULL].horizon
     for name in _MEASURES:
         scores = {label: known.ahead(name) for label, known in evaluation.encoders.items()}
@@ -58,35 +58,35 @@ def judge(evaluation: Evaluation) -> Judged:
             break
     else:
         nothing = (
-            f"of these {evaluation.data.test_rows:,} held-out steps even the full observation "
-            "tells next to nothing of what comes next"
+            f"even the full observation predicts next to nothing of these "
+            f"{evaluation.data.test_rows:,} held-out steps"
         )
-        return Judged("", unsaid=nothing if horizon else untold(evaluation))
+        return Judged("", unknown=nothing if horizon else untold(evaluation))
     by = f"R² of {_MEASURES[name]} over {horizon} steps, at least {_AS_GOOD:.0%} of the best"
-    lacks, least = lacking(evaluation), _AS_GOOD * max(r2.values())
+    misses, least = missed(evaluation), _AS_GOOD * max(r2.values())
     codes = sorted((label for label in r2 if label != FULL), key=lambda label: -r2[label])
-    serving = [label for label in codes if r2[label] >= least]
-    telling = [label for label in codes if r2[label] >= _TOLD]
-    nearest = min(telling, key=lambda label: bool(lacks[label]), default=None)
-    whole = [label for label in serving if not lacks[label]]
-    size = {label: evaluation.encoders[label].latent for label in serving}
-    return Judged(by, serving, min(whole or serving, key=size.__getitem__, default=None), nearest)
+    enough = [label for label in codes if r2[label] >= least]
+    some = [label for label in codes if r2[label] >= _TOLD]
+    nearest = min(some, key=lambda label: bool(misses[label]), default=None)
+    whole = [label for label in enough if not misses[label]]
+    size = {label: evaluation.encoders[label].latent for label in enough}
+    return Judged(by, enough, min(whole or enough, key=size.__getitem__, default=None), nearest)
 
 
 def _headline(evaluation: Evaluation, judged: Judged) -> Table:
     encoders = evaluation.encoders
     first = [name for name, scalar in SCALARS.items() if scalar.is_first]
     names = [n for n in first if any(_score(e, n).value is not None for e in encoders.values())]
-    serves = dict.fromkeys(encoders, "no") | dict.fromkeys(judged.serving, "yes") | {FULL: "-"}
+    enough = dict.fromkeys(encoders, "no") | dict.fromkeys(judged.enough, "yes") | {FULL: "-"}
     rows = [
         (
             *(label, str(known.latent), *(_r2(known, name) for name in names)),
-            "-" if judged.unsaid else serves[label],
+            "-" if judged.unknown else enough[label],
         )
         for label, known in encoders.items()
     ]
     title = say("headline", evaluation, judged)
-    return Table(title, ("encoder", "size", *names, "serves"), rows)
+    return Table(title, ("encoder", "size", *names, "enough"), rows)
 
 
 def _score(known: Diagnostics, name: str) -> Score:
@@ -104,21 +104,21 @@ def _hidden(evaluation: Evaluation) -> Iterator[Table]:
     codes = evaluation.encoders.values()
     if hidden := evaluation.data.hidden:
         rows = [(n, *(r2_text(e.nonlinear_probes[n].value) for e in codes)) for n in hidden]
-        title = "What isn't seen, read from the code: R², nonlinear"
+        title = "What isn't observed, predicted from the latent: R², nonlinear"
         yield Table(title, ("feature", *evaluation.encoders), rows)
 
 
-def _lacks_text(evaluation: Evaluation, width: int | None) -> str:
+def _missed_text(evaluation: Evaluation, width: int | None) -> str:
     if reason := untold(evaluation):
-        return wrapped(f"What each lacks can't be said: {reason}.", width)
+        return wrapped(f"What each misses isn't known: {reason}.", width)
     told = {}
-    for label, features in lacking(evaluation).items():
+    for label, features in missed(evaluation).items():
         some = [f"{each.name} ({r2_text(each.kept)})" for each in features[:_MANY]]
         more = [f"{len(features) - _MANY} more"] if len(features) > _MANY else []
         told[label] = ", ".join((*some, *more)) or "nothing"
     unread = [each.name for each in evaluation.encoders[FULL].loses]
-    title = wrapped("What each lacks of what a controller needs (R² of reading it below .5)", width)
-    nor = f"Nor can the full observation tell {', '.join(unread)}."
+    title = wrapped("What each misses of what a controller needs (decoded with R² < 0.5)", width)
+    nor = f"The full observation doesn't show {', '.join(unread)} either."
     lines = [title, facts(told, width, indent=0)] if told else []
     return "\n".join((*lines, *([wrapped(nor, width)] if unread else ())))
 
@@ -135,8 +135,8 @@ def untold(evaluation: Evaluation) -> str:
     return "the reward of these steps can't be predicted, and no --policy says what it looks at"
 
 
-def lacking(evaluation: Evaluation) -> dict[str, list[Lost]]:
-    """What each code lacks that the full observation has, the most needed first."""
+def missed(evaluation: Evaluation) -> dict[str, list[Lost]]:
+    """What each encoder misses that the full observation has, the most needed first."""
     beyond = {each.name for each in evaluation.encoders[FULL].loses}
     return {
         label: [each for each in known.loses if each.name not in beyond]

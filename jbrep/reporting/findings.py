@@ -41,7 +41,7 @@ class Agents(Record, frozen=True, kw_only=True):
     seeds: list[int]
     failed: list[int]  # seeds
     encoders: int
-    learnt: str  # whether they end above the best policy that doesn't look: yes, no or unclear
+    learnt: str  # whether they end above the best blind baseline: yes, no or unclear
     rises: bool  # whether returns surely still rise at the end of training
     curve: dict[str, Any]  # over the grid of the group: percentiles, mean, IQM with its interval
     by_run: dict[str, list[float | None]]  # in the order of seeds
@@ -72,7 +72,7 @@ class Group(Record, frozen=True, kw_only=True):
     failure_return: float | None
     ends: dict[str, float | None]  # returns that score 0 and 1
     blind: Score
-    best_policy: str | None  # of those that don't look
+    best_policy: str | None  # of the blind baselines
     references: Numbers
     in_training: dict[str, float]  # the same, where the starts of all evaluations are those
     thresholds: dict[str, float | None]

@@ -119,7 +119,7 @@ def _returns_table(name: str, groups: Sequence[Group], found: Findings, brief: b
         "runs": lambda each: str(len(each.seeds)),
         "failed": lambda each: str(len(each.failed) or "-"),
         "final return": _number("final_return_mean", form),
-        "learned": lambda each: each.learnt,
+        "above baselines": lambda each: each.learnt,
         "score": _number("score", ".2f"),
         "rising": lambda each: "yes" if each.rises else "-",
         **(
@@ -276,7 +276,7 @@ def diagnostic_tables(found: Findings) -> list[Table]:
         "diagnostic": lambda each: each.diagnostic,
         "what it is": lambda each: each.words,
         "rank correlation": lambda each: interval(each.correlation, ".2f"),
-        "codes": lambda each: str(len(each.values)),
+        "encoders": lambda each: str(len(each.values)),
         "families": lambda each: str(len({*each.families})),
     }
     tables = []
@@ -289,7 +289,7 @@ def diagnostic_tables(found: Findings) -> list[Table]:
 def return_form(groups: Sequence[Group], more: int = 0) -> str:
     """A format for returns: three digits of the range of final returns, or more of them.
 
-    Those of policies that don't look are among them. Of a range that is small beside the returns
+    Those of blind baselines are among them. Of a range that is small beside the returns
     themselves, as many as give these five.
     """
     returns = [

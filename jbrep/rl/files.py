@@ -72,7 +72,7 @@ class Episode(NamedTuple):
     """An episode of training."""
 
     step: int  # of training, over all lanes, at its end
-    lane: int
+    env: int  # its number
     episode_return: float
     length: int  # control steps
     diverged: bool  # whether its physics did, which ended it

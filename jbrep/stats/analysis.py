@@ -89,7 +89,7 @@ class GroupAnalysis:
 
     @property
     def best_policy(self) -> str | None:
-        """The best of the policies that don't look; None if there is none."""
+        """The best blind baseline; None if there is none."""
         return best_blind({policy: mean.value for policy, mean in self.references.items()})
 
 

@@ -39,7 +39,7 @@ class RepresentationResult:
     seeds: tuple[int, ...]  # of the runs, in ascending order
     failed: tuple[int, ...]  # seeds of the runs that failed
     encoders: int  # how many they have among them
-    # whether they end above the best policy that doesn't look: yes, no, or unclear
+    # whether they end above the best blind baseline: yes, no, or unclear
     learnt: str
     curve: Curve  # over the grid of the group
     by_run: Mapping[str, Array]  # numbers of each run by name, (runs,) each, in the order of seeds

@@ -60,7 +60,7 @@ class Pair(NamedTuple):
 
     @property
     def y_learns(self) -> bool:
-        """Whether y ends above the best policy that doesn't look, beyond chance."""
+        """Whether y ends above the best blind baseline, beyond chance."""
         return surely_above(self.y.final, self.ends.blind, self.bounds)
 
 

@@ -72,9 +72,9 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
     reference: Annotated[
         str | Annotated[float, Meta(ge=-LARGEST_RETURN, le=LARGEST_RETURN)],
         Meta(
-            description="What scores 1, where the best policy that doesn't look scores 0: a "
+            description="What scores 1, where the best blind baseline scores 0: a "
             "policy, as jbrep evaluate-policy takes it, or a return.",
-            extra={"default": "the hand-written policy"},
+            extra={"default": "the scripted policy"},
         ),
     ] = ""
 
@@ -114,7 +114,7 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
 
     @property
     def top(self) -> str | float:
-        """What scores 1: the policy or the return that is named, or else the hand-written one."""
+        """What scores 1: the policy or the return that is named, or else the scripted one."""
         return LOOKING if self.reference == "" else self.reference
 
     def baseline_of(self, names: Iterable[str]) -> str:
@@ -292,7 +292,7 @@ def _may_fail(pair: Pair, excess: float, level: float) -> str | None:
 
     Of eight units that all learn a third may fail, unseen, which no interval shows. So the side
     that ends higher than the boundary says has to stay so when that share of it returns no more
-    than the best policy that doesn't look.
+    than the best blind baseline.
     """
     side = pair.x if excess > 0 else pair.y
     failing, units = side.failing, len(side.final)

@@ -37,8 +37,8 @@ class RunCurve:
     # the least possible return of an episode of the task; None if unknown
     return_floor: float | None = None
     return_ceiling: float | None = None  # the largest possible one; None if unknown
-    # the return that gains are counted over, on the starts of evaluation: that of the best policy
-    # that doesn't look; None if unknown
+    # the return that gains are counted over, on the starts of evaluation: that of the best blind
+    # baseline; None if unknown
     reference: float | None = None
     # the same on the starts of `returns`; None if that is `reference`
     reference_in_training: float | None = None

@@ -13,9 +13,9 @@ from jbrep.stats.runs import RunCurve, evaluated_run
 
 SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the gain of the baseline's median run
 SOLVED = "steps_to_solved"
-STILL, CONSTANT, RANDOM = "standing still", "constant drive", "random"  # policies that don't look
+STILL, CONSTANT, RANDOM = "standing still", "constant drive", "random"  # blind baselines
 BLIND = (STILL, CONSTANT, RANDOM)
-LOOKING = "hand-written"  # a policy that does
+LOOKING = "hand-written"  # what tables call the scripted policy
 STEPS_TO = (*(f"steps_to_{name}" for name in SHARES), SOLVED)
 _POINTS = 50  # of a performance profile, about, or half as many: round numbers
 _FAR = 1_000  # times the range of returns, beyond which a floor is no place to begin
@@ -24,7 +24,7 @@ _FAR = 1_000  # times the range of returns, beyond which a floor is no place to 
 class Ends(NamedTuple):
     """The returns that score 0 and 1."""
 
-    blind: float  # of the best policy that doesn't look, over which gains are counted
+    blind: float  # of the best blind baseline, over which gains are counted
     blind_in_training: float  # the same on the starts of the evaluations during training
     top: float  # of a policy that can do the task; NaN if none is known, or above blind
 
@@ -38,7 +38,7 @@ class Scale(NamedTuple):
 
     grid: Array  # training steps at which runs are compared, (g,)
     ends: Ends  # the returns that score 0 and 1
-    blind: Interval  # the mean return of the best policy that doesn't look, by `_blind`
+    blind: Interval  # the mean return of the best blind baseline, by `_blind`
     # the return to reach for each of STEPS_TO, NaN where there is none
     thresholds: Mapping[str, float]
     # at which performance profiles are evaluated, (k,): round numbers that enclose all final
@@ -47,7 +47,7 @@ class Scale(NamedTuple):
 
 
 def best_blind(returns: Mapping[str, float]) -> str | None:
-    """The best of policies that don't look at anything, by mean return; None if there is none."""
+    """The best blind baseline, by mean return; None if there is none."""
     blind = [policy for policy in BLIND if policy in returns]
     return max(blind, key=returns.__getitem__) if blind else None
 
@@ -97,7 +97,7 @@ def scale_of(compared: Compared, policies: Mapping[str, Interval]) -> Scale:
 
 
 def _blind(compared: Compared, run: RunCurve, policies: Mapping[str, Interval]) -> Interval:
-    """The mean return of the best policy that doesn't look, with its interval.
+    """The mean return of the best blind baseline, with its interval.
 
     Where none is known it may be anything from the least possible return, or that of untrained
     policies, upwards.

@@ -320,7 +320,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         if without and not absolute and self.verdicts.reference == "":
             raise InputError(
                 f"verdicts.claims has {NOT_WORSE.name!r}: name verdicts.reference, a policy or a "
-                f"return that scores 1, as {without[0]} has no hand-written policy"
+                f"return that scores 1, as {without[0]} has no scripted policy"
             )
         for claim, units in self.units.items():
             if reason := obstacle(claim, units, self.planned.share):

@@ -21,7 +21,7 @@ TASK = describe("face_direction", episode_steps=STEPS)
 SETTINGS = settings(task=TASK, steps=4_000, store_state=False)
 COMMAND = [
     *(sys.executable, "-c", "from jbrep.cli import main; main()", "collect"),
-    *("--task", "face_direction", "--seed", "3", "--shard-episodes", "1", "--lanes", "1"),
+    *("--task", "face_direction", "--seed", "3", "--shard-episodes", "1", "--num-envs", "1"),
     *("--episode-steps", str(STEPS)),
 ]
 

@@ -41,7 +41,7 @@ def stages(folder):
     data, study = folder / "data", folder / "tiny.toml"
     study.write_text(STUDY.format(data=data))
     states = ("--task", "face_direction", "--episode-steps", 500, "--steps", "2k")
-    states = (*states, "--shard-episodes", 1, "--lanes", 1)
+    states = (*states, "--shard-episodes", 1, "--num-envs", 1)
     training = ("--data", data, "--latent", 4, "--epochs", 30, "--batch-size", 25)
     return {
         "collect": ("collect", *states, "--out", data),
