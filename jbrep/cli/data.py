@@ -18,12 +18,11 @@ from jbrep.text import counted, terminal_width
 
 @command("env Hopper-v5")
 def env(task: str, /, *, as_json: AsJson = False, **options: Annotated[Any, described]) -> None:
-    """Show a task: its features, actions and time limit.
+    """Show a task: its features, actions and time limit, and whether it is reproducible.
 
-    Its features, actions and time limit, and whether it is reproducible. TASK is one of the
-    Jitterbug's, such as face_direction, or an id in Gymnasium's registry; for another package's,
-    --import MODULE, or MODULE:ID, which imports it. The environment is made and played for some
-    steps; that it terminates is only known where it did.
+    TASK is one of the Jitterbug's, such as face_direction, or an id in Gymnasium's registry; for
+    another package's, --import MODULE, or MODULE:ID, which imports it. The environment is made and
+    played for some steps; that it terminates is only known where it did.
     """
     known = described(task, **options)
     assert known

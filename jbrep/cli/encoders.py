@@ -37,10 +37,9 @@ def evaluate(
 ) -> None:
     """Show which encoders retain enough, and what each misses.
 
-    Judged on the held-out episodes: how well they predict the state and the reward, what they say
-    of a good policy's value and action, linear and nonlinear probes, reconstruction, the latent's
-    units, and the prediction of the next latent. An encoder of your own is code such as
-    mymodule:MyEncoder; its module is imported, which runs it.
+    Measured on the held-out episodes: how well they predict changes of the state and the reward, a
+    good policy's value and action, and the features, and how well they reconstruct these. An
+    encoder of your own is code such as mymodule:MyEncoder; its module is imported, which runs it.
 
     Args:
         encoders: files, names that ship, or code, mymodule:MyEncoder; one or several.
