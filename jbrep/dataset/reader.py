@@ -1,7 +1,7 @@
 """Reading a data set."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -101,6 +101,10 @@ class Dataset:
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
+
+    def __iter__(self) -> Iterator[Episode]:
+        """All episodes, one after the other."""
+        return map(self.episode, range(len(self.episodes["length"])))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Dataset, (self.folder,)  # another process opens it anew
