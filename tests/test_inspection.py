@@ -299,8 +299,8 @@ def test_shapes_of_every_kind():
         ({}, "SOURCE"),
         ({"source": FACE, "episode": 9}, "episode 9"),
         ({"source": FACE, "task": describe("move_to_pose")}, "move_to_pose"),
-        ({"source": FACE, "traverse": True}, "--traverse"),
-        ({"encoder": "dae-8"}, "--task"),
+        ({"source": FACE, "traverse": True}, "traverse"),
+        ({"encoder": "dae-8"}, "task"),
         ({"source": POSE, "encoder": DAE}, "dae-4"),
     ],
 )

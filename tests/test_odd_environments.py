@@ -8,11 +8,9 @@ import sys
 import traceback
 
 import pytest
-from command import jbrep
+from command import jbrep as command
 from odd import FAILS, HARMLESS
 
-import jbrep.inspection.recording  # so that not every fork imports it, nor what trains
-import jbrep.rl.training
 from jbrep.cli import main
 from jbrep.dataset import Dataset
 
@@ -122,5 +120,5 @@ def test_a_command_ends_in_what_was_asked_or_in_a_line(how, command, when, tmp_p
 def test_a_worker_s_environment_may_have_processes_too(tmp_path):
     task = ("--task", "odd:Odd-v0", "--env", "how=a simulator", "--env", "when=make")
     sizes = ("--steps", 48, "--shard-episodes", 2, "--threads", 2)
-    told = jbrep("collect", *task, *sizes, "--out", tmp_path / "data")
+    told = command("collect", *task, *sizes, "--out", tmp_path / "data")
     assert told.exit_code == 0, told.output

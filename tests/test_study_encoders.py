@@ -279,7 +279,7 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
             rf"run {TASK}/a2c-paper/m/seed-0 can't start: its encoder .*/{TASK}/m-0.safetensors is",
         ),
         ({"name": "m", "file": "pose.safetensors"}, f"made for move_to_pose, not for {TASK}"),
-        ({"name": "m", "code": "other:Net"}, "importing other runs it; .* add --import other"),
+        ({"name": "m", "code": "other:Net"}, "importing other runs it; .*import.* other"),
         ({"name": "m", "code": "my_encoders:Unseeded"}, "makes another encoder each time"),
     ],
 )

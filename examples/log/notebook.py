@@ -34,7 +34,7 @@ OUT.mkdir()
 # command and a reward.
 
 # %%
-robot = jbrep.describe("face_direction", max_episode_steps=LIMIT)
+robot = jbrep.describe("face_direction", episode_steps=LIMIT)
 export(load_policy(find(robot)), OUT / "earlier.onnx")
 earlier = record(str(OUT / "earlier.onnx"), str(OUT / "walk.csv"), EPISODES, LIMIT)
 print((OUT / "walk.csv").read_text()[:300])

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from jbrep.checking.check import Check
 from jbrep.checking.features import Finding
-from jbrep.envs.description import card
+from jbrep.envs.card import card
 from jbrep.reporting import report, views
 from jbrep.reporting.figures.panels import PAGE, Plot, plain
 

@@ -26,7 +26,7 @@ def env(task: str, /, *, as_json: AsJson = False, **options: Annotated[Any, desc
     """
     known = described(task, **options)
     assert known
-    from jbrep.envs.description import card
+    from jbrep.envs.card import card
     from jbrep.records.record import to_plain
 
     say_json(to_plain(known)) if as_json else say(card(known, terminal_width()))

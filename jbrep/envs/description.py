@@ -2,7 +2,7 @@
 
 import json
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,13 @@ from jbrep.envs.make import creator, give_back, is_batched, take
 from jbrep.envs.names import absolute, code_of, files_of, find_spec, spec_of, taken_for
 from jbrep.envs.physics import can_be_pushed, physics_of
 from jbrep.envs.probe import Bounds, Signals, precision_problems, probe, within
-from jbrep.envs.task import EpisodeSteps, Feature, Frame, Kind, Task, Word
+from jbrep.envs.task import EpisodeSteps, Frame, Kind, Task, Word
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError, Notice, refusing
 from jbrep.records.document import read_toml
 from jbrep.records.record import Finite, Record, converted, from_plain, to_plain
-from jbrep.text import counted, facts, table
 
 _SPREAD_EPISODES = 5  # of random actions
-_MOST_FEATURES = 60  # shown on a card
 
 
 def describe(
@@ -227,56 +225,3 @@ def _spread(plain: str) -> tuple[float, ...]:
                 step = lanes.step([random.uniform(low, high) for random in randoms])
                 seen.append(step.observation[active])
     return tuple(np.concatenate(seen).std(axis=0).tolist())
-
-
-# a task on one screen
-
-
-def card(task: Task, width: int = 80) -> str:
-    """What a task is, as text of at most `width` columns."""
-    shown = task.features[:_MOST_FEATURES]
-    parts = [f"{task.name}\n{facts(dict(_facts(task)), width)}"]
-    parts.append(table(("feature", "unit", "usual range", "kind"), map(_cells, shown), width))
-    if len(shown) < task.size:
-        parts.append(f"... and {task.size - len(shown):,} more; --json lists all")
-    return "\n\n".join(parts)
-
-
-def _facts(task: Task) -> Iterator[tuple[str, str]]:
-    if task.name != task.id:
-        yield "id", task.id
-    if task.arguments:
-        yield "arguments", ", ".join(task.given_arguments)
-    yield "observation", counted(task.size, "feature")
-    bounds = map(_range, task.action_low, task.action_high)
-    yield "action", f"{counted(task.action_size, 'number')} in {', '.join(dict.fromkeys(bounds))}"
-    step = "" if task.timestep is None else f" of {task.timestep:g} s"
-    yield "time limit", f"{task.max_episode_steps:,} steps{step}"
-    if task.terminates is None:
-        yield "terminates", "not within the few episodes that were tried"
-    else:
-        yield "terminates", "yes: a state can end an episode" if task.terminates else "no"
-    if task.reward_low is not None or task.reward_high is not None:
-        yield "reward", f"in {_range(task.reward_low, task.reward_high)}"
-    if task.solved_return is not None:
-        yield "solved", f"from a return of {task.solved_return:,g}"
-    if task.state:
-        yield "states", ", ".join(f"{name} ({width})" for name, width in task.state.items())
-    found = "with the same seed and actions a fresh and a used instance"
-    if task.reproducible:
-        yield "reproducible", f"yes: {found} give the same bits"
-    else:
-        lost = "data sets can't be replayed and stopped runs can't be resumed"
-        yield "reproducible", f"no: {found} differ, so {lost}"
-
-
-def _range(low: float | None, high: float | None) -> str:
-    ends = ["-inf" if low is None else f"{low:g}", "inf" if high is None else f"{high:g}"]
-    return f"[{', '.join(ends)}]"
-
-
-def _cells(feature: Feature) -> tuple[str, ...]:
-    known = feature.low is not None or feature.high is not None
-    usual = _range(feature.low, feature.high) if known else "-"
-    kind = ", ".join(filter(None, (feature.kind, feature.frame)))
-    return feature.name, feature.unit or "-", usual, kind

@@ -242,8 +242,8 @@ class Task(Record, frozen=True):
         if unknown := set(self.offsets or ()) - set(self.whole.feature_names):
             raise InputError(f"offsets has {min(unknown)}, which is none of its features")
 
-    def __repr__(self) -> str:
-        from jbrep.envs.description import card
+    def __str__(self) -> str:
+        from jbrep.envs.card import card
 
         return card(self)
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from gymnasium import spaces
-from msgspec import Meta
+from msgspec import UNSET, Meta
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from jbrep.errors import InputError, refusing
@@ -110,7 +110,7 @@ def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> 
     if name in (of_class := _parameters(algorithm)):
         checked = _typed(name, value, of_class[name])
         if name == "learning_starts":
-            before = before.replace(warm_up=None)
+            before = before.replace(warm_up=UNSET)
         return before.replace(algorithm_kwargs={**before.algorithm_kwargs, name: checked})
     if name not in _OWN:
         checked = _of_policy(algorithm, name, value)

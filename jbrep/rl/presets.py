@@ -7,7 +7,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from jbrep.errors import choose
 from jbrep.records.record import Finite, Record, from_plain
@@ -87,7 +87,7 @@ class Hyperparameters(Record, frozen=True):
     )
     normalize: bool = False  # whether the agent sees its input by the running mean and variance
     # learning begins after this share of a run's steps, if learning_starts hasn't come before
-    warm_up: Annotated[float, Meta(gt=0, le=1)] | None = None
+    warm_up: Annotated[float, Meta(gt=0, le=1)] | UnsetType = UNSET
     # control steps for which each action is held, which are one step of the agent; what else counts
     # steps here counts the agent's
     action_repeat: Annotated[int, Meta(ge=1, le=MAX_REPEAT)] = 1
@@ -97,7 +97,7 @@ class Hyperparameters(Record, frozen=True):
 
     def within(self, control_steps: int) -> "Hyperparameters":
         """The same in a run of so many steps, as its warm-up says."""
-        if self.warm_up is None:
+        if self.warm_up is UNSET:
             return self
         usual = self.algorithm_kwargs["learning_starts"]
         return self.learning_from(min(usual, int(self.warm_up * self.agent_steps(control_steps))))

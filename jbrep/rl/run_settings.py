@@ -100,7 +100,7 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
     def beginning_as(self, before: "RunSettings") -> "RunSettings":
         """The same with the warm-up of another run, if a share of the steps decides it."""
         chosen, first = self.hyperparameters, before.hyperparameters.algorithm_kwargs
-        if chosen.warm_up is None or "learning_starts" not in first:
+        if chosen.warm_up is UNSET or "learning_starts" not in first:
             return self
         return self.replace(hyperparameters=chosen.learning_from(first["learning_starts"]))
 

@@ -33,7 +33,7 @@ SEEDS = 16
 STUDY = as_study(
     {
         "tasks": ["face_direction", "move_in_direction"],
-        "algorithms": ["sac"],
+        "algorithms": ["sac-paper"],
         "representations": list(TRUTH),
         "seeds": SEEDS,
         "steps": 10_000,
