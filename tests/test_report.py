@@ -185,7 +185,7 @@ def test_verdicts_are_the_same_wherever_they_are_told(judged, tmp_path):
 
 def test_the_markdown_shows_numbers_and_a_figure_that_is_there(whole):
     text = (whole / MARKDOWN).read_text()
-    assert text.startswith("# a-study\n")
+    assert text.startswith("# face_direction: full, dae-8, pca-8\n")
     order = ("> Failed runs: 1.", "| agents on |", "![", "compared with full:")
     assert [text.index(each) for each in order] == sorted(text.index(each) for each in order)
     (figure,) = re.findall(r"!\[.*\]\((.*)\)", text)
@@ -194,7 +194,7 @@ def test_the_markdown_shows_numbers_and_a_figure_that_is_there(whole):
     assert re.search(r"\n\| standing still \| .* \| 260 \[", text)
     found = json.loads((whole / FINDINGS).read_text())
     failed = [run for run in found["runs"] if run["status"] == "failed"]
-    assert [(run["label"], run["seed"]) for run in failed] == [("face_direction/sac/dae-8", 0)]
+    assert [(run["label"], run["seed"]) for run in failed] == [("face_direction/sac-wide/dae-8", 0)]
     mean = found["groups"][0]["agents"][0]["numbers"]["final_return_mean"][0]
     assert f"| full | 4 | - | {mean:.0f} [" in text
 

@@ -120,7 +120,7 @@ def test_a_runs_folder(short):
     assert run.cpu
     played = [(e.step, e.episode) for e in read_evaluations(short)]
     assert played == [(0, 0), (80, 0), (80, 1)]
-    assert (short / "episodes.csv").read_text() == "step,lane,return,length,diverged\n"
+    assert (short / "episodes.csv").read_text() == "step,env,return,length,diverged\n"
     assert list((short / "tensorboard").glob("events.*"))
     assert not (short / "checkpoint.safetensors").exists()
 
