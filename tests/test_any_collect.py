@@ -100,6 +100,7 @@ def test_shards_of_episodes_that_may_end_early_are_started_together(tmp_path):
     assert not Growth(tmp_path, brief).wants(1)
 
 
+@pytest.mark.slow
 def test_a_shard_that_kills_every_worker_is_named(tmp_path, monkeypatch):
     """test_pool has one that is made again."""
     monkeypatch.setattr(backends, "ATTEMPTS", 2)
@@ -151,6 +152,7 @@ def test_an_environment_that_fails_ends_the_command_in_one_line(tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_a_shard_that_fails_doesn_t_matter_until_it_is_needed(tmp_path):
     """It was begun ahead of time; the one before it takes longer."""
 

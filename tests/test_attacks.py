@@ -6,6 +6,7 @@ import sys
 NAMES = ("checkpoints of sac", "import of parquet", "registration")  # tools/attack.py has all
 
 
+@pytest.mark.slow
 def test_whatever_happens_to_a_command_nothing_false_comes_of_it():
     """In a process of its own, as it forks."""
     command = [sys.executable, "-W", "ignore", "tools/attack.py", "1", *NAMES]

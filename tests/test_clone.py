@@ -18,7 +18,7 @@ from jbrep.dataset import Dataset, Layout, from_table
 from jbrep.encoders import find
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError
-from jbrep.play.sources import exported_player, find_player
+from jbrep.play.sources import find_player
 from jbrep.rl.controller import export
 from jbrep.training.windows import Windows
 
@@ -215,7 +215,7 @@ def test_a_clone_with_an_environment_plays_it_like_a_run(home, upright):
     again = find_player(str(home / "plays")).returns(12)
     np.testing.assert_allclose(agent.returns, again, atol=1e-3)
     export(agent.policy, home / "plays.onnx")
-    alone = exported_player(home / "plays.onnx").returns(12)
+    alone = find_player(home / "plays.onnx").returns(12)
     np.testing.assert_allclose(alone, again, atol=1e-3)
     kept = jbrep.collect(upright.task, home / "by-the-clone", 60, policy=str(home / "plays"))
     assert kept.manifest.settings.policy["run"] == str(home / "plays")

@@ -47,6 +47,7 @@ def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
         np.testing.assert_array_equal(ours.returns, theirs.returns)
 
 
+@pytest.mark.slow
 def test_data_from_a_cluster_are_the_same(tmp_path, monkeypatch):
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr("jbrep.envs.names._imported", [])

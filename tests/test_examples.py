@@ -45,6 +45,7 @@ LESS = {  # to do in own.py
 }
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_figure")
 @pytest.mark.filterwarnings("ignore")  # a user sees them once, if at all
 def test_everything_that_one_can_bring(tmp_path, monkeypatch, capfd):

@@ -64,7 +64,7 @@ def test_the_command_tells_it(swing, monkeypatch):
     encoder = "encoders/linear-forward-3.safetensors"
     judge = ("evaluate", "--encoder", encoder, "--data", "history", "--out", "judged")
     told = jbrep(*judge, "--truth", "whole").output
-    assert "What isn't seen, read from the code: R², nonlinear\n\nfeature  full" in told
+    assert "What isn't observed, predicted from the latent: R², nonlinear\n\nfeature  full" in told
     assert f"\n{SPEED}    " in told
     assert "is not an evaluation of these encoders" in mistake(*judge)
 

@@ -117,6 +117,7 @@ def test_a_command_ends_in_what_was_asked_or_in_a_line(how, command, when, tmp_p
     assert problem(command, how, when, tmp_path / "it") is None
 
 
+@pytest.mark.slow
 def test_a_worker_s_environment_may_have_processes_too(tmp_path):
     task = ("--task", "odd:Odd-v0", "--env", "how=a simulator", "--env", "when=make")
     sizes = ("--steps", 48, "--shard-episodes", 2, "--threads", 2)

@@ -170,22 +170,22 @@ def test_the_smallest_code_without_a_loss_is_to_take_and_else_the_smallest(evalu
         "small": good.replace(latent=2, loses=lost),
     }
     judged = judge(evaluation.replace(encoders=codes))
-    assert (judged.take, {*judged.serving}) == ("large", {"large", "larger", "small"})
+    assert (judged.recommended, {*judged.enough}) == ("large", {"large", "larger", "small"})
     codes |= {label: codes[label].replace(loses=lost) for label in ("large", "larger")}
-    assert judge(evaluation.replace(encoders=codes)).take == "small"
+    assert judge(evaluation.replace(encoders=codes)).recommended == "small"
 
 
 def test_nothing_is_said_where_it_cannot_be(evaluation):
     codes = {name: evaluation.encoders[name] for name in ("full", "without load", "noise")}
     judged = judge(evaluation.replace(encoders=codes))
-    assert (judged.take, judged.nearest) == (None, "without load")
+    assert (judged.recommended, judged.nearest) == (None, "without load")
     full, unknown = codes["full"], Score(None, None, None)
     blind = {
         steps: ahead.replace(rewarded=unknown, reward=unknown, mean=unknown)
         for steps, ahead in full.prediction.items()
     }
     nothing = evaluation.replace(encoders=codes | {"full": full.replace(prediction=blind)})
-    assert judge(nothing).unsaid
+    assert judge(nothing).unknown
     assert evaluation.encoders["without load"].method == {"spectrum": [3.0, 1.0]}
 
 

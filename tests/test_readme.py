@@ -38,7 +38,10 @@ if "MyRobot-v0" not in gymnasium.registry:
     hopper = "gymnasium.envs.mujoco.hopper_v5:HopperEnv"
     gymnasium.register("MyRobot-v0", hopper, max_episode_steps=100)
 """
-LOG = "t,angle,cmd_0\n" + "".join(f"{i / 50},{i % 7},{i % 3}\n" for i in range(500))
+LOG = "t,angle,cmd_0\n" + "".join(
+    f"{i / 50 + i // 100 * 9},{i % 7},{i % 3}\n"
+    for i in range(500)  # with pauses
+)
 
 
 def commands(page):
@@ -88,6 +91,7 @@ def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
         assert (tmp_path / made).stat().st_size, made
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_figure")
 @pytest.mark.filterwarnings("ignore")  # of very short runs
 def test_ten_minutes_lead_from_a_robot_to_a_code(tmp_path, monkeypatch):

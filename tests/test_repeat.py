@@ -93,7 +93,7 @@ def run(tmp_path_factory):
 
 def test_everything_counts_control_steps(run):
     rows = [line.split(",") for line in (run / EPISODES).read_text().splitlines()]
-    assert rows[0] == ["step", "lane", "return", "length", "diverged"]
+    assert rows[0] == ["step", "env", "return", "length", "diverged"]
     assert [(int(step), int(length)) for step, _, _, length, _ in rows[1:]] == [
         (step, 50)
         for step in (104, 104, 208, 208)  # 13 actions of two robots, the last cut short

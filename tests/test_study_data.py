@@ -140,7 +140,7 @@ def test_mistaken_data_are_refused(representations, data, named):
     ("task", "policy", "named"),
     [
         (TASK, "sideways", "data.policy for face_direction: unknown policy 'sideways'"),
-        ("Pendulum-v1", "heuristic", "data.policy for Pendulum-v1: .* no hand-written policy"),
+        ("Pendulum-v1", "heuristic", "data.policy for Pendulum-v1: .* no scripted policy"),
         ("Pendulum-v1", "trained", "data.policy for Pendulum-v1: no trained policy"),
     ],
 )

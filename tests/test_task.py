@@ -52,7 +52,7 @@ def test_an_environment_of_gymnasium():
     assert (hopper.name, hopper.slug, hopper.size) == ("Hopper-v5", "Hopper-v5", 11)
     assert hopper.feature_names[:3] == ("rootz", "rooty", "thigh_joint")  # after its joints
     assert hopper.feature_names[-1] == "foot_joint_velocity"
-    assert repr(hopper).startswith("Hopper-v5\n")
+    assert str(hopper).startswith("Hopper-v5\n")
     assert (hopper.action_low, hopper.action_high) == ((-1.0,) * 3, (1.0,) * 3)
     assert (hopper.max_episode_steps, hopper.timestep) == (1000, 0.008)
     assert (hopper.terminates, hopper.reproducible, hopper.seed_bits) == (True, True, 63)
