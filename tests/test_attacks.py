@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 NAMES = ("checkpoints of sac", "import of parquet", "registration")  # tools/attack.py has all
 
 
