@@ -21,7 +21,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=44_000)
     given = parser.parse_args()
     sys.path.insert(0, str(ROOT / "examples/check"))
-    import robots  # noqa: F401  # it registers the last two
+    import robots  # type: ignore[import-not-found]  # noqa: F401  # it registers the last two
 
     print("| task | found | begin with |\n|---|---|---|", flush=True)
     for robot in given.robots:

@@ -94,8 +94,8 @@ def read(folder: Path) -> Scored:
         families=[kinds[code] for code in codes],
         pairs=pairs,
         returns=finals.mean(1),
-        good=[*judge(evaluation).serving],
-        taken=judge(evaluation).take,
+        good=[*judge(evaluation).enough],
+        taken=judge(evaluation).recommended,
     )
 
 
