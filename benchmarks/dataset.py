@@ -28,7 +28,7 @@ from jbrep.jitterbug.simulation import PHYSICS_STEPS, fast_model, stop_profiling
 from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS
 
 TASK = "face_direction"
-LANES = 50
+NUM_ENVS = 50
 ROWS = 5_000_000
 BATCH = 8192
 ROUNDS = 6
@@ -83,24 +83,26 @@ def dm_control_loop(folder: Path) -> float:
 
 def collected_rate(folder: Path) -> float:
     """Control steps per second of collecting a shard to the disk."""
-    settings = DataSettings(task=describe(TASK), steps=LANES * EPISODE_STEPS, shard_episodes=LANES)
+    settings = DataSettings(
+        task=describe(TASK), steps=NUM_ENVS * EPISODE_STEPS, shard_episodes=NUM_ENVS
+    )
 
-    return settings.steps / timed(lambda: collect(settings, folder, LANES))
+    return settings.steps / timed(lambda: collect(settings, folder, NUM_ENVS))
 
 
 def bare_rate() -> float:
     """Control steps per second of the same physics and nothing else."""
-    batch = Batch(fast_model(), LANES, 0)
+    batch = Batch(fast_model(), NUM_ENVS, 0)
     control = batch.bind("ctrl")
     random = np.random.default_rng(0)
 
     def episodes() -> None:
         batch.reset()
         for _ in range(EPISODE_STEPS):
-            control[:] = random.uniform(-1, 1, (LANES, 1))
+            control[:] = random.uniform(-1, 1, (NUM_ENVS, 1))
             batch.step(nstep=PHYSICS_STEPS)
 
-    return LANES * EPISODE_STEPS / timed(episodes)
+    return NUM_ENVS * EPISODE_STEPS / timed(episodes)
 
 
 def compare_collectors(folder: Path) -> None:

@@ -27,7 +27,7 @@ from jbrep.jitterbug.simulation import PHYSICS_STEPS, fast_model, stop_profiling
 from jbrep.jitterbug.tasks import EPISODE_STEPS
 
 TASK = "move_in_direction"
-LANES = 64
+NUM_ENVS = 64
 THREADS = 2
 WORKERS = (2, 4, 8)
 ROUNDS = 60  # short ones, side by side: these machines' speed wanders
@@ -74,8 +74,8 @@ def subprocesses(make: Callable[[], gymnasium.Env], workers: int) -> Stepper:
     return sb3(SubprocVecEnv([make] * workers))
 
 
-def bare_physics(lanes: int, threads: int) -> Stepper:
-    batch = Batch(fast_model(), lanes, threads)
+def bare_physics(envs: int, threads: int) -> Stepper:
+    batch = Batch(fast_model(), envs, threads)
     control = batch.bind("ctrl")
     random = np.random.default_rng(0)
     steps = count()
@@ -83,9 +83,9 @@ def bare_physics(lanes: int, threads: int) -> Stepper:
     def step() -> int:
         if next(steps) % EPISODE_STEPS == 0:  # a robot that fell long ago is another load
             batch.reset()
-        control[:] = random.uniform(-1, 1, (lanes, 1))
+        control[:] = random.uniform(-1, 1, (envs, 1))
         batch.step(nstep=PHYSICS_STEPS)
-        return lanes
+        return envs
 
     return step
 
@@ -106,8 +106,8 @@ def rate_of_dm_control() -> float:
 
 def main() -> None:
     plain = "dm_control in a loop"
-    batched = f"jbrep, {LANES} lanes, {THREADS} threads"
-    bare = f"bare physics, {LANES} lanes, {THREADS} threads"
+    batched = f"jbrep, {NUM_ENVS} environments, {THREADS} threads"
+    bare = f"bare physics, {NUM_ENVS} environments, {THREADS} threads"
     steppers = {
         **{
             f"SubprocVecEnv of dm_control, {n} workers": subprocesses(shimmy_env, n)
@@ -117,10 +117,10 @@ def main() -> None:
     }
     stop_profiling()
     steppers |= {
-        batched: sb3(JitterbugVecEnv(TASK, LANES, num_threads=THREADS)),
-        bare: bare_physics(LANES, THREADS),
-        "jbrep, 1 lane": sb3(JitterbugVecEnv(TASK, 1, num_threads=1)),
-        "bare physics, 1 lane": bare_physics(1, 1),
+        batched: sb3(JitterbugVecEnv(TASK, NUM_ENVS, num_threads=THREADS)),
+        bare: bare_physics(NUM_ENVS, THREADS),
+        "jbrep, 1 environment": sb3(JitterbugVecEnv(TASK, 1, num_threads=1)),
+        "bare physics, 1 environment": bare_physics(1, 1),
     }
     rates: dict[str, list[float]] = {name: [] for name in (plain, *steppers)}
     with ProcessPoolExecutor(1, get_context("spawn")) as elsewhere:
@@ -145,8 +145,8 @@ def main() -> None:
     show("batched / dm_control in a loop", ratio(batched, plain), ">= 2.8")
     show("batched / best SubprocVecEnv of dm_control", ratio(batched, best), ">= 2.4")
     show("batched / bare physics", ratio(batched, bare), ">= 0.92")
-    single = ratio("bare physics, 1 lane", "jbrep, 1 lane")
-    show("cost of one lane / bare physics", single, "<= 1.25")
+    single = ratio("bare physics, 1 environment", "jbrep, 1 environment")
+    show("cost of one environment / bare physics", single, "<= 1.25")
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from jbrep.encoders.vec_env import JitterbugVecEnv as JitterbugVecEnv
     from jbrep.encoders.wrapper import Encoded as Encoded
     from jbrep.envs.description import describe as describe
-    from jbrep.envs.lanes import Lanes as Lanes
+    from jbrep.envs.environments import Environments as Environments
     from jbrep.envs.task import Feature as Feature
     from jbrep.envs.task import Task as Task
     from jbrep.rl.controller import load_policy as load_policy

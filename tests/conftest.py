@@ -113,13 +113,13 @@ def diverging(brief, monkeypatch, tmp_path):
     starts = Dataset(brief).episodes["initial_qpos"][:, QUATERNION]
     reset, step, remaining = Simulation.reset, Simulation.step, {}
 
-    def begin(simulation, lanes, *others):
-        reset(simulation, lanes, *others)
-        for lane in lanes:
-            remaining.pop((simulation, lane), None)
+    def begin(simulation, envs, *others):
+        reset(simulation, envs, *others)
+        for index in envs:
+            remaining.pop((simulation, index), None)
             for episode, steps in ((1, 30), (2, 0)):
-                if (simulation.readings.qpos[lane, QUATERNION] == starts[episode]).all():
-                    remaining[simulation, lane] = steps
+                if (simulation.readings.qpos[index, QUATERNION] == starts[episode]).all():
+                    remaining[simulation, index] = steps
 
     def spoil(simulation, action):
         for at in [at for at in remaining if at[0] is simulation]:

@@ -30,10 +30,10 @@ def test_rows_are_the_episodes_of_a_random_policy(collected):
     assert dataset["action"][:].std() == pytest.approx(1 / np.sqrt(3), rel=0.02)
 
 
-def test_neither_lanes_nor_threads_change_a_byte(tmp_path):
+def test_neither_environments_nor_threads_change_a_byte(tmp_path):
     """A shard of two episodes and one of one."""
     made = []
-    for how in ({}, {"lanes": 1, "num_threads": 1}, {"lanes": 3, "num_threads": 2}):
+    for how in ({}, {"num_envs": 1, "num_threads": 1}, {"num_envs": 3, "num_threads": 2}):
         folder = tmp_path / f"{len(made)}"
         collect(small.brief(steps=300, shard_episodes=2), folder, **how)
         made.append(contents(folder))
@@ -44,7 +44,7 @@ def test_neither_lanes_nor_threads_change_a_byte(tmp_path):
     ("changes", "how", "named"),
     [
         ({}, {"backend": "slurm"}, "slurm"),
-        ({}, {"lanes": 0}, "at least 1"),
+        ({}, {"num_envs": 0}, "at least 1"),
         ({}, {"num_threads": 0}, "at least 1"),
         ({"policy": {"kind": "sprint"}}, {}, "sprint"),
     ],

@@ -9,7 +9,7 @@ import torch
 
 import jbrep
 from jbrep.envs.description import describe
-from jbrep.envs.lanes import Lanes
+from jbrep.envs.environments import Environments
 from jbrep.errors import InputError
 from jbrep.rl import Run, train
 from jbrep.rl.agent import acting
@@ -56,13 +56,13 @@ def difference_over_an_episode(trained, controller, steps=200):
 
     The spread of these actions is given, too: a policy of one action would be like any other.
     """
-    lanes = Lanes(trained.task, 1)
-    lanes.reset([0], [3])
+    envs = Environments(trained.task, 1)
+    envs.reset([0], [3])
     act, pairs = trained.begin(trained.task, [3]), []
     for _ in range(steps):
-        ours, theirs = controller(lanes.observation[0]), act(lanes.observation)[0]
+        ours, theirs = controller(envs.observation[0]), act(envs.observation)[0]
         pairs.append((ours, theirs))
-        lanes.step(theirs[None])
+        envs.step(theirs[None])
     ours, theirs = map(np.array, zip(*pairs, strict=True))
     return np.abs(ours - theirs).max(), theirs.std()
 

@@ -1,4 +1,4 @@
-"""The contract that dm_control holds its own domains to, and equality with the batched lanes."""
+"""The contract that dm_control holds its own domains to, and equality with the batch."""
 
 from unittest import mock
 
@@ -102,21 +102,21 @@ def test_observations_share_no_memory(task):
         assert not any(np.may_share_memory(array, b) for b in arrays[i + 1 :])
 
 
-def test_every_lane_has_the_same_episode_bit_for_bit(task):
-    """A plain dm_control environment and a lane among others, over two episodes."""
+def test_every_environment_has_the_same_episode_bit_for_bit(task):
+    """A plain dm_control environment and an environment among others, over two episodes."""
     environment = jitterbug.load(task, seed=5, time_limit=1)
-    lanes = Simulation(get_task(task), 3, 2)
+    envs = Simulation(get_task(task), 3, 2)
     randoms = [np.random.default_rng(seed) for seed in (4, 5, 6)]
     actions = np.random.default_rng(0)
     for _ in range(2):
         step = environment.reset()
-        lanes.reset(range(3), randoms)
+        envs.reset(range(3), randoms)
         while True:
             flat = np.concatenate(list(step.observation.values()))
-            np.testing.assert_array_equal(flat, lanes.observe()[1])
+            np.testing.assert_array_equal(flat, envs.observe()[1])
             if step.last():
                 break
             action = actions.uniform(-1, 1, (3, 1))
             step = environment.step(action[1])
-            lanes.step(action)
-            assert step.reward == lanes.reward()[1]
+            envs.step(action)
+            assert step.reward == envs.reward()[1]

@@ -63,22 +63,22 @@ def test_many_robots_are_one_repeated_with_its_own_seed():
     assert isinstance(many, JitterbugVectorEnv)
     singles = [gymnasium.make(FACE, max_episode_steps=40) for _ in range(3)]
     observation, _ = many.reset(seed=7)
-    for lane, single in enumerate(singles):
-        np.testing.assert_array_equal(observation[lane], single.reset(seed=7 + lane)[0])
+    for index, single in enumerate(singles):
+        np.testing.assert_array_equal(observation[index], single.reset(seed=7 + index)[0])
     random = np.random.default_rng(0)
     for step in range(1, 101):
         actions = random.uniform(-1, 1, (3, 1)).astype(np.float32)
         observation, reward, terminated, truncated, info = many.step(actions)
         assert not terminated.any()
         assert truncated.all() == truncated.any() == (step % 40 == 0)
-        for lane, single in enumerate(singles):
-            one = single.step(actions[lane])
-            assert reward[lane] == one[1]
-            assert truncated[lane] == one[3]
-            if truncated[lane]:
-                np.testing.assert_array_equal(info["final_obs"][lane], one[0])
+        for index, single in enumerate(singles):
+            one = single.step(actions[index])
+            assert reward[index] == one[1]
+            assert truncated[index] == one[3]
+            if truncated[index]:
+                np.testing.assert_array_equal(info["final_obs"][index], one[0])
                 one = single.reset()
-            np.testing.assert_array_equal(observation[lane], one[0])
+            np.testing.assert_array_equal(observation[index], one[0])
 
 
 def test_a_robot_that_diverges_is_truncated_and_flagged():
@@ -93,7 +93,7 @@ def test_a_robot_that_diverges_is_truncated_and_flagged():
     assert info["non_finite"]
 
 
-def test_a_lane_that_diverges_starts_anew_alone():
+def test_a_environment_that_diverges_starts_anew_alone():
     many = gymnasium.make_vec(FACE, num_envs=3)
     many.reset(seed=0)
     many.step(np.zeros((3, 1)))
@@ -122,7 +122,7 @@ def test_mistakes_are_named():
     assert str(next_step) in refused(lambda: gymnasium.make_vec(FACE, autoreset_mode=next_step))
     assert "side" in refused(lambda: gymnasium.make(FACE, camera="side"))
     many = gymnasium.make_vec(FACE, num_envs=2)
-    assert "3 seeds for 2 lanes" in refused(lambda: many.reset(seed=[1, 2, 3]))
+    assert "3 seeds for 2 environments" in refused(lambda: many.reset(seed=[1, 2, 3]))
     many.reset()
     assert "(2, 1)" in refused(many.step, np.zeros(2))
     single = gymnasium.make(FACE).unwrapped
@@ -156,7 +156,7 @@ def test_a_window_without_a_display_is_refused_in_one_line():
     assert "jbrep.errors.InputError: render_mode 'human'" in done.stderr.splitlines()[-1]
 
 
-def test_lanes_are_reset_by_hand_where_autoreset_is_off():
+def test_environments_are_reset_by_hand_where_autoreset_is_off():
     """By the mask, with seeds of their own; the others go on, those that have ended too."""
     off = gymnasium.vector.AutoresetMode.DISABLED
     many = gymnasium.make_vec(FACE, num_envs=3, max_episode_steps=5, autoreset_mode=off)

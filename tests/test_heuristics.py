@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jbrep.envs import Lanes, describe
+from jbrep.envs import Environments, describe
 from jbrep.envs.recording import episode_returns
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.tasks import TASKS
@@ -19,7 +19,9 @@ LEAST = {
 
 @pytest.mark.parametrize("task", TASKS)
 def test_median_return_of_four_episodes(task):
-    assert np.median(episode_returns(Lanes(describe(task), 4), HEURISTICS[task])) >= LEAST[task]
+    assert (
+        np.median(episode_returns(Environments(describe(task), 4), HEURISTICS[task])) >= LEAST[task]
+    )
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -9,8 +9,8 @@ from command import in_this_process, jbrep, refused
 from small import flip_bit
 
 from jbrep.envs import describe
+from jbrep.envs.environments import Environments
 from jbrep.envs.infos import by_name, number_of, numbers_in, shares
-from jbrep.envs.lanes import Lanes
 from jbrep.envs.names import import_modules
 from jbrep.reporting import report
 from jbrep.reporting.findings import Findings
@@ -63,20 +63,20 @@ def test_shares_are_numbers_that_are_0_or_1():
 
 
 def test_an_episode_succeeds_if_any_of_its_steps_does():
-    """Each lane's numbers are its own last step's, and a success is forgotten at the next reset."""
-    lanes = Lanes(describe(SCORED), 2)
-    lanes.reset([0, 1], [1, 2])
-    assert lanes.numbers == [{}, {}]
+    """Numbers are of each one's last step, and a success is forgotten at the next reset."""
+    envs = Environments(describe(SCORED), 2)
+    envs.reset([0, 1], [1, 2])
+    assert envs.numbers == [{}, {}]
     for step in range(1, 7):
-        lanes.step(np.zeros((2, 3)))
-        assert [each["is_success"] for each in lanes.numbers] == [step >= 3, 0.0]
-        assert [each["steps"] for each in lanes.numbers] == [step, step]
-    lanes.reset([0], [2])
-    assert [*map(dict.keys, lanes.numbers)] == [{}.keys(), dict.fromkeys(NAMES).keys()]
-    lanes.step(np.zeros((2, 3)))
-    assert [each["is_success"] for each in lanes.numbers] == [0.0, 0.0]
-    assert [each["steps"] for each in lanes.numbers] == [1.0, 6.0]
-    assert Lanes(describe("face_direction"), 2).numbers == [{}, {}]
+        envs.step(np.zeros((2, 3)))
+        assert [each["is_success"] for each in envs.numbers] == [step >= 3, 0.0]
+        assert [each["steps"] for each in envs.numbers] == [step, step]
+    envs.reset([0], [2])
+    assert [*map(dict.keys, envs.numbers)] == [{}.keys(), dict.fromkeys(NAMES).keys()]
+    envs.step(np.zeros((2, 3)))
+    assert [each["is_success"] for each in envs.numbers] == [0.0, 0.0]
+    assert [each["steps"] for each in envs.numbers] == [1.0, 6.0]
+    assert Environments(describe("face_direction"), 2).numbers == [{}, {}]
 
 
 def test_a_run_keeps_them_and_says_the_shares(run):

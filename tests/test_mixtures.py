@@ -42,8 +42,8 @@ def test_episodes_say_which_policy_acted_in_them(mixture):
     assert jbrep("data", "verify", mixture, "--replay", 2).exit_code == 0
 
 
-def test_neither_lanes_nor_threads_change_a_byte(mixture, tmp_path):
-    collect(mixed(), tmp_path / "data", lanes=3, num_threads=2)
+def test_neither_environments_nor_threads_change_a_byte(mixture, tmp_path):
+    collect(mixed(), tmp_path / "data", envs=3, num_threads=2)
     assert contents(tmp_path / "data") == contents(mixture)
 
 

@@ -8,10 +8,10 @@ from jbrep.rl.agent import ColouredActionNoise
 STEPS = 1000
 
 
-def episodes(beta, sigma, lanes):
-    """What environments draw in their first episode, (lanes, steps)."""
+def episodes(beta, sigma, envs):
+    """What environments draw in their first episode, (environments, steps)."""
     np.random.seed(0)  # noqa: NPY002 - stable-baselines3 draws there
-    each = [ColouredActionNoise(beta, sigma, 1, STEPS) for _ in range(lanes)]
+    each = [ColouredActionNoise(beta, sigma, 1, STEPS) for _ in range(envs)]
     return np.array([[float(one()[0]) for _ in range(STEPS)] for one in each])
 
 

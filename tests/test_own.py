@@ -245,10 +245,10 @@ def test_an_encoded_environment_shows_latents():
     np.testing.assert_array_equal(again.reset(seed=3)[0], env.reset(seed=3)[0])
 
 
-@pytest.mark.parametrize("lanes", [1, 3])
-def test_latents_are_those_of_the_vec_env_to_the_bit(lanes):
-    ours = JitterbugVecEnv("face_direction", lanes, 3, find("dae-8", "face_direction"), 1, 10)
-    if lanes == 1:
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_latents_are_those_of_the_vec_env_to_the_bit(num_envs):
+    ours = JitterbugVecEnv("face_direction", num_envs, 3, find("dae-8", "face_direction"), 1, 10)
+    if num_envs == 1:
         theirs = DummyVecEnv([lambda: Encoded(one(), "dae-8")])
         theirs.seed(3)
         first = theirs.reset()
@@ -256,14 +256,16 @@ def test_latents_are_those_of_the_vec_env_to_the_bit(lanes):
         theirs = Encoded(gymnasium.make_vec(FACE, num_envs=3, max_episode_steps=10), "dae-8")
         first, _ = theirs.reset(seed=3)
     np.testing.assert_array_equal(first, ours.reset())
-    assert first in theirs.observation_space if lanes > 1 else first[0] in theirs.observation_space
-    action = np.full((lanes, 1), 0.3, np.float32)
+    assert (
+        first in theirs.observation_space if num_envs > 1 else first[0] in theirs.observation_space
+    )
+    action = np.full((num_envs, 1), 0.3, np.float32)
     for step in range(10):
         seen, (latent, _, _, infos) = theirs.step(action), ours.step(action)
         if step < 9:
             np.testing.assert_array_equal(seen[0], latent)
-    for lane, info in enumerate(infos):
-        final = seen[3][0]["terminal_observation"] if lanes == 1 else seen[4]["final_obs"][lane]
+    for index, info in enumerate(infos):
+        final = seen[3][0]["terminal_observation"] if num_envs == 1 else seen[4]["final_obs"][index]
         np.testing.assert_array_equal(final, info["terminal_observation"])
 
 

@@ -11,8 +11,8 @@ from gymnasium.envs.registration import EnvSpec
 from small import assert_same_files
 
 from jbrep.dataset import DataSettings
-from jbrep.envs import Lanes, describe
-from jbrep.envs.autoreset import AutoresetLanes
+from jbrep.envs import Environments, describe
+from jbrep.envs.autoreset import AutoresetEnvironments
 from jbrep.envs.description import with_domain
 from jbrep.envs.domain import Domain, Draws, read_ranges
 from jbrep.envs.physics import put_factors, velocity_after
@@ -41,22 +41,22 @@ BODIES = {"body": "0..3", "friction": "0.5..1.5"}
 
 
 def tape(task, seeds=SEEDS, delay=0):
-    """Observations, rewards and whether each lane's episode goes on, of the same actions."""
+    """Observations, rewards and whether each environment's episode goes on, of the same actions."""
     random = np.random.default_rng(1)
     rows = random.uniform(task.action_low, task.action_high, (11, task.action_size))
     rows = np.concatenate((np.tile(task.rest, (delay, 1)), rows))
-    lanes = Lanes(task, len(seeds), 1)
-    steps = [(lanes.reset(range(len(seeds)), seeds), np.zeros(len(seeds)))]
+    envs = Environments(task, len(seeds), 1)
+    steps = [(envs.reset(range(len(seeds)), seeds), np.zeros(len(seeds)))]
     for action in rows[:11]:
-        steps.append(lanes.step(np.tile(action, (len(seeds), 1)))[:2])
-    lanes.close()
+        steps.append(envs.step(np.tile(action, (len(seeds), 1)))[:2])
+    envs.close()
     observations, rewards = zip(*steps, strict=True)
     return np.stack(observations), np.stack(rewards)
 
 
-def assert_same(one, other, lanes=slice(None)):
+def assert_same(one, other, envs=slice(None)):
     for a, b in zip(one, other, strict=True):
-        assert a[:, lanes].tobytes() == b.tobytes()
+        assert a[:, envs].tobytes() == b.tobytes()
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
@@ -112,13 +112,13 @@ def test_a_drawn_body_is_the_body_of_that_number():
 @pytest.mark.parametrize("name", ["face_direction", "Pendulum-v1"])
 def test_what_was_seen_last_stays_where_the_next_episode_begins(name):
     task = with_domain(TASKS[name], {"delay": 1})
-    robots = AutoresetLanes(task, len(SEEDS), 1)
+    robots = AutoresetEnvironments(task, len(SEEDS), 1)
     robots.reset(SEEDS)
     steps = [robots.step(np.tile(task.action_high, (len(SEEDS), 1))) for _ in range(12)]
     assert steps[-1].ended.all()
-    lanes = Lanes(task, len(SEEDS), 1)
-    lanes.reset(range(len(SEEDS)), SEEDS)
-    alone = [lanes.step(np.tile(task.action_high, (len(SEEDS), 1)))[0] for _ in range(12)]
+    envs = Environments(task, len(SEEDS), 1)
+    envs.reset(range(len(SEEDS)), SEEDS)
+    alone = [envs.step(np.tile(task.action_high, (len(SEEDS), 1)))[0] for _ in range(12)]
     np.testing.assert_array_equal(steps[-1].final, alone[-1])
     assert (steps[-1].final != steps[-1].observation).any(axis=1).all()
 
@@ -138,11 +138,11 @@ def test_noise_is_a_share_of_what_features_spread():
     assert 0.5 < cosine < 1
     assert 1 < speed < 8
     still, noise = np.zeros((20, 1)), []
-    lanes = [Lanes(each, 20, 1) for each in (task, with_domain(task, {}))]
-    for each in lanes:
+    envs = [Environments(each, 20, 1) for each in (task, with_domain(task, {}))]
+    for each in envs:
         each.reset(range(20), range(20))
-    while lanes[0].num_active:
-        noisy, plain = (each.step(still).observation for each in lanes)
+    while envs[0].num_active:
+        noisy, plain = (each.step(still).observation for each in envs)
         noise.append(noisy - plain)
     noise = np.stack(noise)
     np.testing.assert_allclose(noise.std(axis=(0, 1)) / task.domain.spread, 0.1, rtol=0.05)
@@ -234,18 +234,18 @@ class Loaded(gymnasium.Env):
 
 
 def test_what_an_environment_draws_itself_stays_drawn(monkeypatch):
-    """Two lanes, of which one plays a second episode; a factor is on top of it."""
+    """Two environments, of which one plays a second episode; a factor is on top of it."""
     spec = EnvSpec("Loaded-v0", Loaded, max_episode_steps=9)
     monkeypatch.setitem(gymnasium.registry, "Loaded-v0", spec)
 
     def masses(**domain):
-        lanes, still = Lanes(describe("Loaded-v0", domain=domain), 2), np.zeros((2, 1))
-        lanes.reset([0, 1], [1, 2])
-        first = lanes.step(still).reward
-        lanes.reset([0], [3])
-        legs = [lane.unwrapped.model.body_mass[2] for lane in lanes.envs]
-        second = lanes.step(still).reward
-        lanes.close()
+        envs, still = Environments(describe("Loaded-v0", domain=domain), 2), np.zeros((2, 1))
+        envs.reset([0, 1], [1, 2])
+        first = envs.step(still).reward
+        envs.reset([0], [3])
+        legs = [env.unwrapped.model.body_mass[2] for env in envs.instances]
+        second = envs.step(still).reward
+        envs.close()
         return np.array([*first, *second, *legs])
 
     drawn = masses()

@@ -31,9 +31,9 @@ ARM = Task(
 )
 
 
-def drives(policy, lanes=50, steps=1000, seed=0, task=TASK):
-    act = policy.begin(task, range(seed, seed + lanes))
-    observation = np.zeros((lanes, task.size))
+def drives(policy, envs=50, steps=1000, seed=0, task=TASK):
+    act = policy.begin(task, range(seed, seed + envs))
+    observation = np.zeros((envs, task.size))
     return np.stack([act(observation) for _ in range(steps)])
 
 
@@ -54,7 +54,7 @@ def test_uniform_drives_fill_the_range_and_don_t_hang_together():
 
 def test_ornstein_uhlenbeck_noise_has_the_spread_and_memory_of_its_constants():
     """After many time constants: sigma / sqrt(2 theta), correlation exp(-theta t)."""
-    actions = drives(OrnsteinUhlenbeck(mu=0.2, theta=5, sigma=0.5), lanes=200)[..., 0]
+    actions = drives(OrnsteinUhlenbeck(mu=0.2, theta=5, sigma=0.5), envs=200)[..., 0]
     assert (actions[0] == 0.2).all()  # its mean, where it starts
     actions = actions[200:]
     assert actions.mean() == pytest.approx(0.2, abs=0.01)
@@ -65,8 +65,8 @@ def test_ornstein_uhlenbeck_noise_has_the_spread_and_memory_of_its_constants():
 
 def test_episodes_have_streams_of_their_own():
     """What an episode's generator gives doesn't depend on those beside it."""
-    both = drives(Uniform(), lanes=2)
-    np.testing.assert_array_equal(both[:, 1:], drives(Uniform(), lanes=1, seed=1))
+    both = drives(Uniform(), envs=2)
+    np.testing.assert_array_equal(both[:, 1:], drives(Uniform(), envs=1, seed=1))
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_mistakes_are_named(text, message):
 
 @pytest.mark.parametrize("policy", [Uniform(), Constant(0.5), OrnsteinUhlenbeck(sigma=9)], ids=str)
 def test_actions_of_several_numbers_keep_to_the_bounds_of_each(policy):
-    actions = drives(policy, lanes=20, steps=200, task=ARM)
+    actions = drives(policy, envs=20, steps=200, task=ARM)
     assert actions.shape == (200, 20, 3)
     low, high = np.array(ARM.action_low), np.array(ARM.action_high)
     assert (low <= actions).all()
@@ -123,17 +123,17 @@ def test_actions_of_several_numbers_keep_to_the_bounds_of_each(policy):
 def test_standing_still_is_zero_or_what_is_next_to_it():
     pushed = ARM.replace(action_low=(0.5, 0.0, -2.0))
     for task, expected in ((ARM, [0, 0, 0]), (pushed, [0.5, 0, 0])):
-        actions = drives(Still(), lanes=2, steps=3, task=task)
+        actions = drives(Still(), envs=2, steps=3, task=task)
         np.testing.assert_array_equal(actions, np.broadcast_to(expected, (3, 2, 3)))
 
 
 def test_drives_are_not_rescaled_where_the_bounds_are_those_of_drives():
     """Scaling -1 + (x + 1) would change the last bits of most."""
     rough = OrnsteinUhlenbeck(theta=1, sigma=3)
-    own = drives(rough, lanes=2, task=ARM.replace(timestep=TASK.timestep))[:, :, :1]
+    own = drives(rough, envs=2, task=ARM.replace(timestep=TASK.timestep))[:, :, :1]
     assert (own > -1).any()
     wide = ARM.replace(action_low=(-1.0,), action_high=(1.0,), timestep=TASK.timestep, draws=6)
-    np.testing.assert_array_equal(drives(rough, lanes=2, task=wide), drives(rough, lanes=2))
+    np.testing.assert_array_equal(drives(rough, envs=2, task=wide), drives(rough, envs=2))
 
 
 def test_a_policy_draws_beyond_what_the_environment_draws():
@@ -158,14 +158,14 @@ MIXTURE = parse_policy("uniform:1+constant:drive=0.5:2+heuristic:1")
 
 def test_each_episode_of_a_mixture_has_one_of_its_policies():
     """Each in its share of the episodes, drawn from the seed alone; its actions are its own."""
-    actions = drives(MIXTURE, lanes=400, steps=3)
+    actions = drives(MIXTURE, envs=400, steps=3)
     weights = [weight for weight, _ in MIXTURE.parts]
     drawn = np.array([episode_part(seed, weights) for seed in range(400)])
     np.testing.assert_allclose(np.bincount(drawn) / 400, weights, atol=0.06)
-    alone = [drives(policy, lanes=400, steps=3) for _, policy in MIXTURE.parts]
-    for lane, part in enumerate(drawn):
-        np.testing.assert_array_equal(actions[:, lane], alone[part][:, lane])
-    np.testing.assert_array_equal(drives(MIXTURE, lanes=1, seed=7)[:3, 0], actions[:, 7])
+    alone = [drives(policy, envs=400, steps=3) for _, policy in MIXTURE.parts]
+    for index, part in enumerate(drawn):
+        np.testing.assert_array_equal(actions[:, index], alone[part][:, index])
+    np.testing.assert_array_equal(drives(MIXTURE, envs=1, seed=7)[:3, 0], actions[:, 7])
     assert make_policy(MIXTURE.settings()) == MIXTURE
 
 

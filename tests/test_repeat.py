@@ -9,8 +9,8 @@ from small import settings
 from jbrep.collecting import collect
 from jbrep.dataset import Dataset
 from jbrep.envs import describe
-from jbrep.envs.autoreset import AutoresetLanes
-from jbrep.envs.lanes import Lanes
+from jbrep.envs.autoreset import AutoresetEnvironments
+from jbrep.envs.environments import Environments
 from jbrep.play.sources import find_player, find_policy
 from jbrep.rl import Run, train
 from jbrep.rl.agent import evaluate
@@ -25,10 +25,10 @@ BLOCKS = np.arange(50) // REPEAT
 
 
 class Failing:
-    """Physics that diverges in a lane at a step, and says so in that step alone."""
+    """Physics that diverges in an environment at a step, and says so in that step alone."""
 
-    def __init__(self, env, lane, step):
-        self._env, self._lane, self._step, self._taken = env, lane, step, 0
+    def __init__(self, env, index, step):
+        self._env, self._index, self._step, self._taken = env, index, step, 0
 
     def __getattr__(self, name):
         return getattr(self._env, name)
@@ -37,34 +37,34 @@ class Failing:
         self._taken += 1
         *moved, info = self._env.step(actions)
         diverged = np.zeros(self._env.num_envs, np.bool_)
-        diverged[self._lane] = self._taken == self._step
+        diverged[self._index] = self._taken == self._step
         moved[3] = moved[3] | diverged
         return *moved, {**info, "non_finite": diverged}
 
 
 def test_a_held_action_is_the_same_as_its_steps_one_by_one():
-    endless, lanes = AutoresetLanes(TASK, 2, repeat=REPEAT), Lanes(TASK, 2)
-    np.testing.assert_array_equal(endless.reset([3, 4]), lanes.reset(range(2), [3, 4]))
+    endless, envs = AutoresetEnvironments(TASK, 2, repeat=REPEAT), Environments(TASK, 2)
+    np.testing.assert_array_equal(endless.reset([3, 4]), envs.reset(range(2), [3, 4]))
     random = np.random.default_rng(0)
     for step in range(13):
         action, reward = random.uniform(-1, 1, (2, 1)), np.zeros(2)
         for _ in range(min(REPEAT, 50 - REPEAT * step)):
-            reward += lanes.step(action).reward
+            reward += envs.step(action).reward
         moved = endless.step(action)
         np.testing.assert_array_equal(moved.reward, reward)
-        np.testing.assert_array_equal(moved.final, lanes.observation)
+        np.testing.assert_array_equal(moved.final, envs.observation)
         np.testing.assert_array_equal(moved.length, min(REPEAT * (step + 1), 50))
         np.testing.assert_array_equal(moved.ended, step == 12)
-    usual = AutoresetLanes(TASK, 2)
+    usual = AutoresetEnvironments(TASK, 2)
     usual.reset([3, 4])
     for _ in range(50):
         following = usual.step(np.zeros((2, 1)))
     np.testing.assert_array_equal(moved.observation, following.observation)
 
 
-def test_a_lane_that_diverges_while_an_action_is_held_waits_for_the_others():
-    endless = AutoresetLanes(TASK, 2, repeat=REPEAT)
-    endless.lanes._batch = Failing(endless.lanes._batch, lane=1, step=6)
+def test_a_environment_that_diverges_while_an_action_is_held_waits_for_the_others():
+    endless = AutoresetEnvironments(TASK, 2, repeat=REPEAT)
+    endless.envs._batch = Failing(endless.envs._batch, index=1, step=6)
     endless.reset([0, 1])
     moved = [endless.step(np.ones((2, 1))) for _ in range(3)]
     assert [each.length.tolist() for each in moved] == [[4, 4], [8, 6], [12, 4]]
@@ -120,7 +120,7 @@ def test_whoever_plays_the_policy_holds_its_actions(run, tmp_path):
         assert_held(episode)
     agent = sb3_class("sac").load(run / POLICY_ZIP)
     assert agent.action_repeat == REPEAT
-    returns = evaluate(agent, Lanes(TASK, 3), load_run(run).encoder, 3).returns
+    returns = evaluate(agent, Environments(TASK, 3), load_run(run).encoder, 3).returns
     np.testing.assert_allclose(returns, last, atol=6e-4)
 
 

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from tensors import torch_threads
 
 from jbrep.encoders import find
-from jbrep.envs import Lanes, describe
+from jbrep.envs import Environments, describe
 from jbrep.envs.recording import Outcome, episode_returns
 from jbrep.errors import InputError
 from jbrep.rl import Run, Session, StoppedError, train
@@ -132,7 +132,7 @@ def test_plain_sb3_loads_the_policy_that_was_evaluated(short):
     rows = encoder(np.random.default_rng(0).normal(size=(50, 16)).astype(np.float32))
     expected = plain.predict(rows, deterministic=True)[0]
     np.testing.assert_array_equal(trained.policy.predict(rows, deterministic=True)[0], expected)
-    returns = episode_returns(Lanes(TASK, 1), trained.begin(TASK, [0]), EVALUATION_SEED)
+    returns = episode_returns(Environments(TASK, 1), trained.begin(TASK, [0]), EVALUATION_SEED)
     at_end = [e.episode_return for e in read_evaluations(short) if e.step == 80]
     np.testing.assert_allclose(returns, at_end[:1], atol=5e-4)
 
@@ -140,14 +140,14 @@ def test_plain_sb3_loads_the_policy_that_was_evaluated(short):
 def test_evaluation_is_the_deterministic_policys_return():
     agent = agent_of("ppo")
     encoder = find("dae-8", TASK)
-    lanes, total = Lanes(TASK, 2), np.zeros(2)
-    lanes.reset([0, 1], [EVALUATION_SEED, EVALUATION_SEED + 1])
+    envs, total = Environments(TASK, 2), np.zeros(2)
+    envs.reset([0, 1], [EVALUATION_SEED, EVALUATION_SEED + 1])
     for _ in range(STEPS):
-        latent = encoder(lanes.observation.astype(np.float32))
-        total += lanes.step(agent.predict(latent, deterministic=True)[0]).reward
-    lanes = Lanes(TASK, 2)
+        latent = encoder(envs.observation.astype(np.float32))
+        total += envs.step(agent.predict(latent, deterministic=True)[0]).reward
+    envs = Environments(TASK, 2)
     for _ in range(2):  # the same episodes each time
-        returns = evaluate(agent, lanes, encoder, 2).returns
+        returns = evaluate(agent, envs, encoder, 2).returns
         np.testing.assert_allclose(returns, total, rtol=1e-5)
 
 
@@ -161,7 +161,7 @@ def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path)
     assert sorted({e.step for e in read_evaluations(often)}) == steps
     rows = [line.split(",") for line in (often / "episodes.csv").read_text().splitlines()[1:]]
     assert [(row[0], row[1], row[3], row[4]) for row in rows] == [
-        ("800", str(lane), f"{STEPS}", "0") for lane in range(8)
+        ("800", str(index), f"{STEPS}", "0") for index in range(8)
     ]
     assert len({row[2] for row in rows}) > 4
 

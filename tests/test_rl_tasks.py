@@ -7,9 +7,9 @@ from command import jbrep
 from small import ONE_EACH, assert_same_files
 
 from jbrep.encoders import find
-from jbrep.envs import Lanes, describe
-from jbrep.envs.autoreset import AutoresetLanes
-from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs import Environments, describe
+from jbrep.envs.autoreset import AutoresetEnvironments
+from jbrep.envs.environments import EnvironmentFailedError
 from jbrep.errors import InputError
 from jbrep.play.sources import find_player
 from jbrep.records import container
@@ -78,7 +78,7 @@ def test_evaluations_are_in_the_order_of_their_starts():
     encoder = find("full", HOPPER)
     chosen = get_preset("modern", "sac")
     agent = make_agent("sac", chosen, make_env(HOPPER, chosen, 0, encoder), 0)
-    together, alone = (evaluate(agent, Lanes(HOPPER, n), encoder, 4).returns for n in (4, 1))
+    together, alone = (evaluate(agent, Environments(HOPPER, n), encoder, 4).returns for n in (4, 1))
     assert len(set(together.round(3))) == 4
     np.testing.assert_allclose(together, alone, rtol=1e-4)
 
@@ -90,7 +90,7 @@ def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(tmp_path):
     steps = []
     with pytest.raises(StoppedError):
         train(run, other, Session(lambda _, step: steps.append(step), stop=lambda: steps[-1] >= 64))
-    assert len(container.read(other / CHECKPOINT, "checkpoint")[0]["lanes.actions"])
+    assert len(container.read(other / CHECKPOINT, "checkpoint")[0]["envs.actions"])
     train(run, other)
     assert_same_files(one, other, EPISODES, EVALUATIONS, POLICY)
 
@@ -100,7 +100,7 @@ def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
     result = train(run, tmp_path)
     assert result.status == FAILED
     assert f"at step 7 of the episode with seed {training_seed(0) + 3}" in result.reason
-    assert result.reason.endswith(" after 48 steps")  # of 8 lanes
+    assert result.reason.endswith(" after 48 steps")  # of 8 environments
     assert read_run(tmp_path) == result
     assert [row.step for row in read_evaluations(tmp_path)] == [0]
     assert not (tmp_path / POLICY).exists()
@@ -118,7 +118,7 @@ def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
         train(run, tmp_path, Session(stop=iter((False, True)).__next__))
     before = (tmp_path / CHECKPOINT).read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(AutoresetLanes, "restore", broken)
+        patch.setattr(AutoresetEnvironments, "restore", broken)
         with pytest.raises(InputError, match="can't be resumed: out of order"):
             train(run, tmp_path)
     assert (tmp_path / CHECKPOINT).read_bytes() == before
@@ -129,15 +129,15 @@ def test_what_was_learned_outlives_an_environment_that_fails(tmp_path, monkeypat
     run = Run.of(CART, "sac", steps=160, preset="modern", overrides=SMALL, **ONE_EACH)
     session = Session(save_every=0, keep_checkpoint=True)
     whole = train(run, tmp_path / "whole", session)
-    count, step = iter(range(1 << 20)), Lanes.step
+    count, step = iter(range(1 << 20)), Environments.step
 
-    def failing(lanes, actions):
+    def failing(envs, actions):
         if next(count) == 60:
             raise EnvironmentFailedError("the cable is loose")
-        return step(lanes, actions)
+        return step(envs, actions)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Lanes, "step", failing)
+        patch.setattr(Environments, "step", failing)
         with pytest.raises(InputError, match=r"is loose; .* goes on from it"):
             train(run, tmp_path / "run", session)
     assert not (tmp_path / "run" / RUN).exists()
@@ -189,13 +189,15 @@ def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(tmp_path, monkeypatch)
     assert jbrep(*settings, folder, "--steps", 160).exit_code == 0
     kept = (CHECKPOINT, EPISODES, EVALUATIONS, POLICY, "policy.zip", RUN)
     before = {name: (folder / name).read_bytes() for name in kept}
-    count, step = iter(range(1 << 20)), Lanes.step
+    count, step = iter(range(1 << 20)), Environments.step
 
-    def failing(lanes, actions):
-        return broken() if next(count) == 60 else step(lanes, actions)
+    def failing(envs, actions):
+        return broken() if next(count) == 60 else step(envs, actions)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Lanes, "step", failing)  # once the episode of now has been played again
+        patch.setattr(
+            Environments, "step", failing
+        )  # once the episode of now has been played again
         told = jbrep(*settings, folder, "--steps", 320)
     assert told.exit_code == 1
     assert "the run failed: out of order" in told.stderr

@@ -18,7 +18,7 @@ from jbrep.collecting import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import find_problems
 from jbrep.envs import describe, make
-from jbrep.envs.autoreset import AutoresetLanes
+from jbrep.envs.autoreset import AutoresetEnvironments
 from jbrep.envs.names import import_modules
 from jbrep.rl.files import read_run
 
@@ -144,9 +144,9 @@ def test_one_instance_describes_collects_and_evaluates(tmp_path):
 @pytest.mark.parametrize(("algorithm", "drifts"), [("sac", False), ("ppo", True)])
 def test_training_and_evaluation_share_the_one_robot(algorithm, drifts, tmp_path, monkeypatch):
     """Evaluations wait for the end of an episode; normalised observations are the new ones."""
-    begun, restart = [], AutoresetLanes.restart
+    begun, restart = [], AutoresetEnvironments.restart
     monkeypatch.setattr(
-        AutoresetLanes, "restart", lambda lanes: begun.append(lanes) or restart(lanes)
+        AutoresetEnvironments, "restart", lambda envs: begun.append(envs) or restart(envs)
     )
     run = ("rl", *arm(tmp_path, drifts=drifts), "--algorithm", algorithm, "--normalize")
     small = "learning_starts=10" if algorithm == "sac" else "n_steps=32"

@@ -9,7 +9,7 @@ import pytest
 from jbrep.collecting import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.encoders import find
-from jbrep.envs import Lanes, describe
+from jbrep.envs import Environments, describe
 from jbrep.envs.recording import episode_returns
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS
@@ -92,7 +92,7 @@ def test_a_policy_before_training_is_the_one_that_was_evaluated_first(run):
 def test_a_named_policy_plays_alone_as_among_others():
     task = describe("move_to_pose", episode_steps=200)
     alone = find_episode("heuristic", 1, task)
-    returns = episode_returns(Lanes(task, 2), HEURISTICS["move_to_pose"], EVALUATION_SEED)
+    returns = episode_returns(Environments(task, 2), HEURISTICS["move_to_pose"], EVALUATION_SEED)
     assert alone.episode_return == pytest.approx(returns[1], rel=1e-6)
     np.testing.assert_array_equal(find_player("heuristic", task).returns(2), returns)
 

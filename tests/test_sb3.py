@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from jbrep import JitterbugVecEnv
 from jbrep.encoders import find
-from jbrep.envs import Lanes, describe
+from jbrep.envs import Environments, describe
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 
@@ -19,8 +19,8 @@ MANY = (FACE, CART, describe("Pendulum-v1", episode_steps=30), describe("Hopper-
 each_task = pytest.mark.parametrize("task", MANY, ids=lambda task: task.name)
 
 
-def actions(steps, lanes, task=FACE):
-    drawn = np.random.default_rng(0).uniform(-1, 1, (steps, lanes, task.action_size))
+def actions(steps, envs, task=FACE):
+    drawn = np.random.default_rng(0).uniform(-1, 1, (steps, envs, task.action_size))
     return drawn.astype(np.float32)
 
 
@@ -38,28 +38,28 @@ def test_spaces_and_types(task):
 
 @each_task
 def test_it_resets_in_the_step_that_ends_the_episode(task):
-    """Each lane goes through the episodes of its seeds, as lanes do that are reset by hand."""
-    environment, lanes = JitterbugVecEnv(task, 3, seed=4), Lanes(task, 3)
+    """Each goes through the episodes of its seeds, as environments do that are reset by hand."""
+    environment, envs = JitterbugVecEnv(task, 3, seed=4), Environments(task, 3)
     scaled = lambda observation: task.scale(observation).astype(np.float32)  # noqa: E731
-    np.testing.assert_array_equal(environment.reset(), scaled(lanes.reset(range(3), [4, 5, 6])))
+    np.testing.assert_array_equal(environment.reset(), scaled(envs.reset(range(3), [4, 5, 6])))
     ends, counters = set(), [itertools.count(1) for _ in range(3)]
     for action in actions(150, 3, task):
         observation, reward, done, infos = environment.step(action)
-        expected = lanes.step(task.unscale_action(action))
+        expected = envs.step(task.unscale_action(action))
         np.testing.assert_array_equal(reward, expected.reward.astype(np.float32))
         np.testing.assert_array_equal(done, expected.terminated | expected.truncated)
-        for lane in np.flatnonzero(done):
-            info, terminated = infos[lane], bool(expected.terminated[lane])
+        for index in np.flatnonzero(done):
+            info, terminated = infos[index], bool(expected.terminated[index])
             ends.add(terminated)
             assert info["TimeLimit.truncated"] is not terminated
             assert info.get("non_finite") is (False if task is FACE else None)
-            final = scaled(expected.observation)[lane]
+            final = scaled(expected.observation)[index]
             np.testing.assert_array_equal(info["terminal_observation"], final)
-            assert not np.array_equal(final, observation[lane])
-            words = np.random.SeedSequence([4 + lane, next(counters[lane])]).generate_state(1)
-            lanes.reset([lane], [int(words[0]) >> 1])
-        assert not any(infos[lane] for lane in np.flatnonzero(~done))
-        np.testing.assert_array_equal(observation, scaled(lanes.observation))
+            assert not np.array_equal(final, observation[index])
+            words = np.random.SeedSequence([4 + index, next(counters[index])]).generate_state(1)
+            envs.reset([index], [int(words[0]) >> 1])
+        assert not any(infos[index] for index in np.flatnonzero(~done))
+        np.testing.assert_array_equal(observation, scaled(envs.observation))
     assert ends == {cart.ID: {True, False}, "Hopper-v5": {True}}.get(task.name, {False})
 
 

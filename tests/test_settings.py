@@ -10,7 +10,7 @@ from small import assert_same_files
 
 from jbrep.encoders import find
 from jbrep.envs import describe
-from jbrep.envs.lanes import Lanes
+from jbrep.envs.environments import Environments
 from jbrep.envs.recording import episode_returns
 from jbrep.errors import InputError
 from jbrep.records.document import toml_text
@@ -181,8 +181,8 @@ def test_a_stopped_run_resumes_to_the_same_bytes_whatever_its_settings(
 def check_last_evaluation(folder):
     """The loaded policy plays the run's last evaluation."""
     trained = load_run(folder)
-    lanes = Lanes(TASK, 2)
-    returns = episode_returns(lanes, trained.begin(TASK, [0, 1]), EVALUATION_SEED)
+    envs = Environments(TASK, 2)
+    returns = episode_returns(envs, trained.begin(TASK, [0, 1]), EVALUATION_SEED)
     last = [row.episode_return for row in read_evaluations(folder) if row.step > 0][-2:]
     np.testing.assert_allclose(returns, last, atol=6e-4)
 
@@ -209,7 +209,7 @@ def test_gradient_steps_and_evaluations_use_the_statistics_without_changing_them
     stored = agent.replay_buffer.observations[:20]
     batch = agent.replay_buffer._get_samples(np.arange(20), env=agent._vec_normalize_env)
     np.testing.assert_array_equal(batch.observations.numpy(), before(stored[:, 0]))
-    evaluate(agent, Lanes(TASK, 2), find("full", TASK), 2)
+    evaluate(agent, Environments(TASK, 2), find("full", TASK), 2)
     after = statistics_of(agent)
     assert (before.count, *before.mean) == (after.count, *after.mean)
 

@@ -1,4 +1,4 @@
-"""Lanes are independent, bit for bit, whatever their number and that of the threads."""
+"""Environments are independent, bit for bit, whatever their number and that of the threads."""
 
 import mujoco
 import numpy as np
@@ -12,7 +12,7 @@ STEPS = 150
 
 
 def rollout(seeds, num_threads, task="move_to_pose", spoil=None):
-    """Observations, rewards and divergence of each seed's lane, (T, n, ...)."""
+    """Observations, rewards and divergence of each seed's environment, (T, n, ...)."""
     simulation = Simulation(get_task(task), len(seeds), num_threads)
     simulation.reset(range(len(seeds)), [np.random.default_rng(seed) for seed in seeds])
     actions = np.stack(
@@ -27,13 +27,13 @@ def rollout(seeds, num_threads, task="move_to_pose", spoil=None):
     return tuple(np.array(column) for column in zip(*tape, strict=True))
 
 
-def assert_same(one, other, lanes=slice(None), of=slice(None)):
+def assert_same(one, other, envs=slice(None), of=slice(None)):
     for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(a[:, lanes], b[:, of])
+        np.testing.assert_array_equal(a[:, envs], b[:, of])
 
 
 @pytest.mark.parametrize("value", [np.nan, 1e12])
-def test_a_lane_that_diverges_says_so_and_leaves_the_others_alone(value):
+def test_a_environment_that_diverges_says_so_and_leaves_the_others_alone(value):
     def spoil(simulation):
         simulation.readings.qvel[1, 4] = value
 
@@ -63,10 +63,10 @@ def test_a_reset_leaves_nothing_of_the_episode_before():
 
 
 def drive(simulation, steps=60):
-    """Observations under the same drive in all lanes, (T, n, d)."""
+    """Observations under the same drive in all environments, (T, n, d)."""
     tape = []
     for step in range(steps):
-        simulation.step(np.full((simulation.num_lanes, 1), 0.8 * np.sin(0.3 * step)))
+        simulation.step(np.full((simulation.num_envs, 1), 0.8 * np.sin(0.3 * step)))
         tape.append(simulation.observe())
     return np.array(tape)
 
@@ -79,12 +79,12 @@ def with_bodies(seeds, body, **more):
 
 
 def assert_moves_like(simulation, models):
-    """Each lane moves bit for bit like a single simulation of its model."""
+    """Each environment moves bit for bit like a single simulation of its model."""
     start, tape = simulation.state, []
     drive(simulation)
-    for lane, model in enumerate(models):
+    for index, model in enumerate(models):
         data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = start["qpos"][lane], start["qvel"][lane]
+        data.qpos[:], data.qvel[:] = start["qpos"][index], start["qvel"][index]
         for step in range(60):
             data.ctrl[0] = 0.8 * np.sin(0.3 * step)
             mujoco.mj_step(model, data, nstep=PHYSICS_STEPS)
@@ -93,30 +93,30 @@ def assert_moves_like(simulation, models):
     np.testing.assert_array_equal(np.hstack([now.qpos, now.qvel]), tape)
 
 
-def test_a_lane_moves_like_a_single_simulation_of_its_body():
+def test_a_environment_moves_like_a_single_simulation_of_its_body():
     simulation = with_bodies(range(3), "random", materials=True)
     numbers = simulation.state["body"].astype(int)
     assert_moves_like(simulation, [plain_model(draw(n, materials=True)) for n in numbers])
 
 
-def test_a_lane_s_model_has_its_friction_and_mass():
+def test_a_environment_s_model_has_its_friction_and_mass():
     simulation, factors = with_bodies(range(3), 7), np.array([(1, 1), (1, 2), (0.2, 0.5)])
     simulation.reset(range(3), [np.random.default_rng(4)] * 3, factors=factors)
-    models, usual = [simulation.model_of(lane) for lane in range(3)], plain_model(draw(7))
+    models, usual = [simulation.model_of(index) for index in range(3)], plain_model(draw(7))
     for model, (friction, mass) in zip(models, factors, strict=True):
         np.testing.assert_allclose(model.geom_friction, friction * usual.geom_friction)
         np.testing.assert_allclose(model.body_subtreemass, mass * usual.body_subtreemass)
     assert_moves_like(simulation, models)
 
 
-def test_a_random_body_is_the_episode_s_whatever_its_lane():
+def test_a_random_body_is_the_episode_s_whatever_its_environment():
     whole = with_bodies(range(6), "random")
     numbers, tape = whole.state["body"], drive(whole)
     assert len(set(numbers)) == 6
     alone, moved = with_bodies([4], "random"), with_bodies([9, 4, 0], "random")
-    for simulation, lane in ((alone, 0), (moved, 1)):
-        assert simulation.state["body"][lane] == numbers[4]
-        np.testing.assert_array_equal(drive(simulation)[:, lane], tape[:, 4])
+    for simulation, index in ((alone, 0), (moved, 1)):
+        assert simulation.state["body"][index] == numbers[4]
+        np.testing.assert_array_equal(drive(simulation)[:, index], tape[:, 4])
 
 
 def test_a_random_body_changes_nothing_else_that_is_drawn():
@@ -147,18 +147,18 @@ def test_a_restored_simulation_continues_with_its_bodies(body):
     np.testing.assert_array_equal(drive(one), drive(other))
 
 
-def test_a_lane_s_model_and_data_are_those_of_its_body():
+def test_a_environment_s_model_and_data_are_those_of_its_body():
     simulation = with_bodies(range(2), "random")
     simulation.step(np.ones((2, 1)))
-    for lane, number in enumerate(simulation.state["body"].astype(int)):
-        model = simulation.model_of(lane)
-        assert model is simulation.model_of(lane)
+    for index, number in enumerate(simulation.state["body"].astype(int)):
+        model = simulation.model_of(index)
+        assert model is simulation.model_of(index)
         assert model.ntexdata > 1000  # to be rendered with
-        own, data = plain_model(draw(number)), simulation.copy_data(lane)
+        own, data = plain_model(draw(number)), simulation.copy_data(index)
         expected = mujoco.MjData(own)
-        expected.qpos[:] = simulation.readings.qpos[lane]
+        expected.qpos[:] = simulation.readings.qpos[index]
         mujoco.mj_kinematics(own, expected)
-        target = simulation.readings.target_position[lane]
+        target = simulation.readings.target_position[index]
         np.testing.assert_allclose(data.geom("target").xpos, target)
         for robot in (data, expected):
             robot.geom("target").xpos[:] = robot.geom("target_pointer").xpos[:] = 0

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from jbrep import api
 from jbrep.cli.generator import parse_pairs
 from jbrep.dataset.schema import episode_seed
-from jbrep.envs import Feature, Lanes, Task, describe
+from jbrep.envs import Environments, Feature, Task, describe
 from jbrep.envs.names import import_modules, imported_modules, name_given, spec_of
 from jbrep.envs.recording import episode_returns
 from jbrep.envs.task import check_same
@@ -71,8 +71,8 @@ def test_one_of_the_dm_control_suite():
     assert task.slug == "dm_control-cartpole-swingup-v0"
     assert task.groups == {"position": slice(0, 3), "velocity": slice(3, 5)}
     assert task.feature_names[2:4] == ("position_2", "velocity_0")
-    lanes = Lanes(task.replace(max_episode_steps=3), 1)
-    lanes.reset([0], [episode_seed(task, 2046, 0)])
+    envs = Environments(task.replace(max_episode_steps=3), 1)
+    envs.reset([0], [episode_seed(task, 2046, 0)])
     for root, number in ((2047, 0), (0, 1 << 20)):
         with pytest.raises(InputError, match="seeds of 31 bits"):
             episode_seed(task, root, number)
@@ -87,12 +87,12 @@ def test_a_dictionary_s_keys_name_the_features_in_the_order_of_flattening():
         *("odd_key_0", "odd_key_1", "signs.part0_0", "signs.part0_1"),
         *("signs.part1_0", "signs.part1_1", "signs.part1_2", "sledge.place", "sledge.speed"),
     )
-    lanes = Lanes(task, 1)
-    lanes.reset([0], [4])
+    envs = Environments(task, 1)
+    envs.reset([0], [4])
     environment = gymnasium.make(task.id)
     observation, _ = environment.reset(seed=4)
     flat = gymnasium.spaces.flatten(environment.observation_space, observation)
-    np.testing.assert_array_equal(lanes.observation[0], flat)
+    np.testing.assert_array_equal(envs.observation[0], flat)
 
 
 def test_an_environment_may_describe_itself():
@@ -114,9 +114,9 @@ def test_arguments_reach_the_environment():
     def returns(name, **arguments):
         task = describe(name, arguments, 15)
         assert task.arguments == arguments
-        lanes = Lanes(task, 2)
+        envs = Environments(task, 2)
         middle = np.tile(np.add(task.action_low, task.action_high) / 2, (2, 1))
-        return episode_returns(lanes, lambda observation: middle)
+        return episode_returns(envs, lambda observation: middle)
 
     assert (returns("Pendulum-v1") == returns("Pendulum-v1", g=10.0)).all()
     assert (returns("Pendulum-v1", g=1.6) != returns("Pendulum-v1")).all()
@@ -198,9 +198,9 @@ def test_a_time_limit_is_the_same_in_each_episode(sledging):
 def test_an_action_may_be_one_number_alone(sledging):
     task = sledging(9, shape=())
     assert task.action_size == 1
-    lanes = Lanes(task, 1)
-    lanes.reset([0], [0])
-    assert lanes.step([[0.1]]).observation.any()
+    envs = Environments(task, 1)
+    envs.reset([0], [0])
+    assert envs.step([[0.1]]).observation.any()
 
 
 def test_observations_must_fit_their_space(sledging):

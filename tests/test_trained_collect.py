@@ -87,9 +87,9 @@ def test_the_policy_acts_as_it_does_for_the_run(runs, tmp_path):
     ).replace("- ", "-")
 
 
-def test_neither_lanes_nor_threads_nor_extension_change_a_byte(data, runs, tmp_path):
+def test_neither_environments_nor_threads_nor_extension_change_a_byte(data, runs, tmp_path):
     text = f"uniform:0.5+{runs / 'jb'}:0.5"
-    for steps, how in ((100, {"lanes": 3}), (240, {"lanes": 1, "num_threads": 1})):
+    for steps, how in ((100, {"num_envs": 3}), (240, {"num_envs": 1, "num_threads": 1})):
         gather(text, tmp_path / "data", how, steps=steps)
     assert contents(tmp_path / "data") == contents(data)
     assert set(Dataset(data).episodes["policy"].tolist()) == {0, 1}

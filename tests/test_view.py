@@ -10,7 +10,7 @@ from test_controller import controller_of, difference_over_an_episode, randomise
 from jbrep.collecting import collect
 from jbrep.collecting.derive import derive
 from jbrep.dataset import Dataset, DataSettings
-from jbrep.envs import Lanes, describe
+from jbrep.envs import Environments, describe
 from jbrep.envs.names import import_modules
 from jbrep.envs.view import with_view
 from jbrep.rl.controller import export
@@ -38,42 +38,42 @@ def test_features_have_names_in_the_past(task, seen):
     assert seen.whole == task.replace(name=seen.name)
 
 
-def stacked(lanes, act):
+def stacked(envs, act):
     """What would be seen of the whole observations, stacked by hand, and the rewards."""
-    names = [i for i, name in enumerate(lanes.task.feature_names) if "velocity" not in name]
-    states = [lanes.observation[:, names]] * 3
-    actions = [np.zeros((lanes.num_lanes, 1))] * 2
+    names = [i for i, name in enumerate(envs.task.feature_names) if "velocity" not in name]
+    states = [envs.observation[:, names]] * 3
+    actions = [np.zeros((envs.num_envs, 1))] * 2
     yield np.hstack([*states, *actions])
-    while lanes.num_active:
+    while envs.num_active:
         action = act()
-        states = [lanes.step(action).observation[:, names], *states[:2]]
+        states = [envs.step(action).observation[:, names], *states[:2]]
         actions = [action, actions[0]]
         yield np.hstack([*states, *actions])
 
 
-def test_lanes_show_the_steps_before(task, seen):
+def test_environments_show_the_steps_before(task, seen):
     random = np.random.default_rng(0)
     drives = random.uniform(-1, 1, (20, 4, 1))
-    whole, lanes = Lanes(task, 4), Lanes(seen, 4)
-    for each in (whole, lanes):
+    whole, envs = Environments(task, 4), Environments(seen, 4)
+    for each in (whole, envs):
         each.reset(range(4), [3, 4, 5, 6])
     expected = stacked(whole, iter(drives).__next__)
-    np.testing.assert_array_equal(lanes.observation, next(expected))
+    np.testing.assert_array_equal(envs.observation, next(expected))
     for drive, wanted in zip(drives, expected, strict=True):
-        np.testing.assert_array_equal(lanes.step(drive).observation, wanted)
-    assert not lanes.num_active
+        np.testing.assert_array_equal(envs.step(drive).observation, wanted)
+    assert not envs.num_active
 
 
 @pytest.mark.parametrize("change", [{"history": 3}, {"domain": {"noise": 0.1}}])
 def test_a_step_that_is_lost_is_not_seen(change):
     broken = describe("Sledges/Broken-v0", {"how": "nan", "seed": 5}, 30, missing="skip", **change)
-    lanes = Lanes(broken, 1)
-    lanes.reset([0], [5])
-    while not lanes.lost.any():
-        before = lanes.observation
-        lanes.step(np.full((1, 3), 0.5))
-    np.testing.assert_array_equal(lanes.observation, before)
-    assert lanes.steps.tolist() == [3]
+    envs = Environments(broken, 1)
+    envs.reset([0], [5])
+    while not envs.lost.any():
+        before = envs.observation
+        envs.step(np.full((1, 3), 0.5))
+    np.testing.assert_array_equal(envs.observation, before)
+    assert envs.steps.tolist() == [3]
 
 
 @pytest.mark.parametrize(

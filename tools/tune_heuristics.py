@@ -16,7 +16,7 @@ from typing import Any
 import cma
 import numpy as np
 
-from jbrep.envs import Lanes, describe
+from jbrep.envs import Environments, describe
 from jbrep.envs.recording import episode_returns
 from jbrep.jitterbug.heuristics import HEURISTICS
 
@@ -41,7 +41,10 @@ def main() -> None:
     }
 
     task = describe(arguments.task)
-    search_lanes, test_lanes = Lanes(task, SEARCH_EPISODES), Lanes(task, TEST_EPISODES)
+    search_envs, test_envs = (
+        Environments(task, SEARCH_EPISODES),
+        Environments(task, TEST_EPISODES),
+    )
 
     def with_factors(factors: np.ndarray) -> dict[str, Any]:
         factor = iter(factors)
@@ -52,7 +55,7 @@ def main() -> None:
 
     def score(factors: np.ndarray, seed: int) -> float:
         candidate = partial(policy, **with_factors(factors))
-        returns = episode_returns(search_lanes, candidate, seed)
+        returns = episode_returns(search_envs, candidate, seed)
         return float(np.median(returns) + np.mean(returns)) / 2
 
     size = sum(len(asdict(gait)) for gait in gaits.values())
@@ -66,7 +69,7 @@ def main() -> None:
         search.tell(candidates, [-score(candidate, seed) for candidate in candidates])
         if search.countiter % REPORT_EVERY == 0:
             constants = with_factors(search.mean)
-            test = episode_returns(test_lanes, partial(policy, **constants), TEST_SEED)
+            test = episode_returns(test_envs, partial(policy, **constants), TEST_SEED)
             low, median, high = np.percentile(test, (10, 50, 90))
             print(
                 f"generation {search.countiter}: {median:.0f} [{low:.0f}, {high:.0f}] {constants}"

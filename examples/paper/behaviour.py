@@ -21,7 +21,7 @@ from matplotlib.colors import LogNorm
 from numpy.typing import NDArray
 
 from jbrep.envs import describe
-from jbrep.envs.lanes import Lanes
+from jbrep.envs.environments import Environments
 from jbrep.envs.task import Task
 from jbrep.jitterbug.tasks import jitterbug_task
 from jbrep.play.player import Player
@@ -64,13 +64,13 @@ def find(sources: Sequence[str], task: Task | None) -> dict[str, list[Player]]:
     return found
 
 
-def turn_targets(lanes: Lanes, yaw: float) -> None:
-    """Turn the target of every lane to that yaw [rad], at the start of its episode."""
-    simulation = lanes.envs.simulation
+def turn_targets(envs: Environments, yaw: float) -> None:
+    """Turn the target of every environment to that yaw [rad], at the start of its episode."""
+    simulation = envs.instances.simulation
     turned = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
-    targets = {"target_quaternion": np.tile(turned, (lanes.num_lanes, 1))}
+    targets = {"target_quaternion": np.tile(turned, (envs.num_envs, 1))}
     simulation.restore(**simulation.state | targets)
-    lanes.observation = lanes.envs.look()
+    envs.observation = envs.instances.look()
 
 
 def watch(players: Sequence[Player], episodes: int, target_yaw: float) -> Visits:
@@ -81,7 +81,7 @@ def watch(players: Sequence[Player], episodes: int, target_yaw: float) -> Visits
             raise SystemExit(f"{player.name}: only the Jitterbug's tasks have its motor")
         for first in range(0, episodes, BATCH):
             some = range(first, min(first + BATCH, episodes))
-            for each in player.play(some, lambda lanes: turn_targets(lanes, target_yaw)):
+            for each in player.play(some, lambda envs: turn_targets(envs, target_yaw)):
                 returns.append(each.episode_return)
                 motor.append(each.motion.qvel[:, -1].copy())  # a view would keep all
                 place.append(each.motion.qpos[:, :2].copy())

@@ -23,8 +23,8 @@ _PATIENCE = 5.0  # seconds to wait for an answer, in step
 def play(task: str, port: int, episode: int, steps: int | None, in_step: bool) -> float:
     """Play an episode of evaluation; its return."""
     described = jbrep.describe(task, episode_steps=steps)
-    lanes, total, late = jbrep.Lanes(described, 1), 0.0, 0
-    observation = lanes.reset([0], [EVALUATION_SEED + episode])[0]
+    envs, total, late = jbrep.Environments(described, 1), 0.0, 0
+    observation = envs.reset([0], [EVALUATION_SEED + episode])[0]
     action = np.zeros(described.action_size, np.float32)
     period = described.timestep or 0.01
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
@@ -36,7 +36,7 @@ def play(task: str, port: int, episode: int, steps: int | None, in_step: bool) -
             until = time.monotonic() + _PATIENCE if in_step else due
             action, is_late = _newest(link, step, until, action)
             late += is_late
-            taken = lanes.step(action[None])
+            taken = envs.step(action[None])
             total += float(taken.reward[0])
             observation = taken.observation[0]
             if not in_step:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from jbrep.collecting.policies import Constant, OrnsteinUhlenbeck, Policy, Still, Uniform
 from jbrep.dataset import Dataset
-from jbrep.envs.lanes import lanes_at_once
+from jbrep.envs.environments import envs_at_once
 from jbrep.envs.recording import held, record
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
@@ -60,21 +60,21 @@ def play(task: Task, steps: int, seed: int) -> tuple[Seen, Played]:
     at_once = min(_AT_ONCE, max(_FEWEST, share // limit)) if task.reproducible else 1
     episodes, returns, seconds = list[_Columns](), dict[str, Array](), 0.0
     with (
-        lanes_at_once(cut, at_once, None, 0) as lanes,
+        envs_at_once(cut, at_once, None, 0) as envs,
         Progress(total=steps, unit="step", unit_scale=True, leave=False, delay=1) as bar,
     ):
         for name, (policy, repeat) in POLICIES.items():
             own, first = list[Array](), seed << 10
             while len(own) < _FEWEST or (sum(map(len, own)) < share and len(own) < _MOST):
-                seeds = range(first, first := first + lanes.num_lanes)
-                lanes.reset(range(lanes.num_lanes), seeds)
+                seeds = range(first, first := first + envs.num_envs)
+                envs.reset(range(envs.num_envs), seeds)
                 act, began = policy.begin(task.replace(timestep=1.0), seeds), time.perf_counter()
-                made = record(lanes, held(act, repeat), bar.update)
+                made = record(envs, held(act, repeat), bar.update)
                 seconds += time.perf_counter() - began
-                for lane, n in enumerate(made.length.tolist()):
-                    rows, action = made.observation[: n + 1, lane], made.action[:n, lane]
-                    own.append(made.reward[:n, lane].astype(np.float64))
-                    ended = bool(made.terminated[lane])
+                for index, n in enumerate(made.length.tolist()):
+                    rows, action = made.observation[: n + 1, index], made.action[:n, index]
+                    own.append(made.reward[:n, index].astype(np.float64))
+                    ended = bool(made.terminated[index])
                     episodes.append(_columns(len(episodes), rows, action, own[-1], ended, name))
             returns[name] = np.array([each.sum() for each in own])
     seen = _joined(task, episodes)

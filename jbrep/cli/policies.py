@@ -143,8 +143,8 @@ def evaluate_policy(
         out: a new JSON file for the table of `perturb`.
     """
     from jbrep.encoders.shipped import source_of
+    from jbrep.envs.environments import EnvironmentFailedError
     from jbrep.envs.infos import Numbers
-    from jbrep.envs.lanes import EnvironmentFailedError
     from jbrep.play.perturbed import read_perturbation
     from jbrep.records.storage import exists, taken
 

@@ -17,7 +17,7 @@ from jbrep.cloning.td3_bc import TD3BC
 from jbrep.dataset import Dataset
 from jbrep.encoders import Encoder, save
 from jbrep.encoders.base import BaseEncoder
-from jbrep.envs.lanes import lanes_at_once
+from jbrep.envs.environments import envs_at_once
 from jbrep.envs.names import environment_versions, spec_of
 from jbrep.envs.recording import Outcome, joined, whole_outcome
 from jbrep.errors import InputError
@@ -264,10 +264,10 @@ def _parts(objective: Cloning, watched: Windows, data: Dataset) -> dict[str, Any
 def _play(trained: Trained, settings: RunSettings, threads: int | None) -> Outcome:
     """What comes of the episodes that every run is evaluated on."""
     count = settings.final_episodes
-    with lanes_at_once(trained.task, settings.evaluation_episodes, threads, 0) as lanes:
-        seeds = range(EVALUATION_SEED, EVALUATION_SEED + count, lanes.num_lanes)
+    with envs_at_once(trained.task, settings.evaluation_episodes, threads, 0) as envs:
+        seeds = range(EVALUATION_SEED, EVALUATION_SEED + count, envs.num_envs)
         begin = partial(trained.begin, trained.task, ())
-        return joined((whole_outcome(lanes, begin, seed) for seed in seeds), count)
+        return joined((whole_outcome(envs, begin, seed) for seed in seeds), count)
 
 
 def _why_not_played(data: Dataset) -> str:

@@ -33,7 +33,7 @@ def local(simulator: Simulator) -> Produce:
     task = simulator.settings.task
     if is_batched(task) or workers == 1 or not _can_be_sent(spec_of(task), simulator):
         return simulator.in_turn
-    return _in_processes(replace(simulator, lanes=1, num_threads=1), workers)
+    return _in_processes(replace(simulator, num_envs=1, num_threads=1), workers)
 
 
 def _can_be_sent(*parts: Any) -> bool:
@@ -135,7 +135,7 @@ def on_ray(simulator: Simulator) -> Produce:
         import ray
 
         make = on_cluster(make_episodes, simulator.num_threads)
-        alone = replace(simulator, lanes=1, num_threads=1)
+        alone = replace(simulator, num_envs=1, num_threads=1)
         known = imported_modules(), spec_of(simulator.settings.task)
         ahead = _Ahead(growth)
         try:

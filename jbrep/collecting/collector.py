@@ -10,7 +10,7 @@ import numpy as np
 from jbrep.collecting.backends import BACKENDS
 from jbrep.collecting.policies import Policy, make_policy
 from jbrep.collecting.replay import replay_problems
-from jbrep.collecting.shards import LANES, SHARD_ROWS, Growth, Produce, Simulator
+from jbrep.collecting.shards import NUM_ENVS, SHARD_ROWS, Growth, Produce, Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import (
     MANIFEST,
@@ -22,7 +22,7 @@ from jbrep.dataset.manifest import (
     write_manifest,
 )
 from jbrep.dataset.schema import EPISODES, DataSettings
-from jbrep.envs.lanes import check_counts
+from jbrep.envs.environments import check_counts
 from jbrep.envs.make import is_batched
 from jbrep.errors import DamageError, InputError, choose, differences
 from jbrep.progress import Progress
@@ -37,7 +37,7 @@ _PILOT = 10  # episodes
 def collect(
     settings: DataSettings,
     folder: Path,
-    lanes: int = LANES,
+    num_envs: int = NUM_ENVS,
     num_threads: int | None = None,
     backend: str = "local",
     policy: Policy | None = None,
@@ -45,15 +45,16 @@ def collect(
 ) -> Manifest:
     """Collect a data set, or what is missing of it; `jbrep.collect` says what its arguments are.
 
-    The bytes depend neither on lanes, threads or backend, nor on whether a data set is collected at
-    once or extended. Before one that is there is continued, an episode of it is played again: it
-    must be the same to the last bit, where the environment is reproducible.
+    The bytes depend neither on the number of environments or threads, nor on the backend, nor on
+    whether a data set is collected at once or extended. Before one that is there is continued, an
+    episode of it is played again: it must be the same to the last bit, where the environment is
+    reproducible.
     """
     policy = policy or make_policy(settings.policy)
     policy.begin(settings.task, [0])  # may refuse the task
     settings = settings.replace(policy=policy.settings())
-    check_counts(lanes, num_threads)
-    simulator = Simulator(settings, policy, lanes, num_threads, retries)
+    check_counts(num_envs, num_threads)
+    simulator = Simulator(settings, policy, num_envs, num_threads, retries)
     produce = choose(backend, BACKENDS, "backend")(simulator)
 
     def check(wanted: Manifest) -> None:

@@ -20,7 +20,7 @@ from jbrep.envs.task import Task
 from jbrep.envs.view import seen_in_episodes, with_view
 from jbrep.errors import InputError, differences
 
-_LANES = 500
+_ENVS = 500
 
 Array = NDArray[Any]
 

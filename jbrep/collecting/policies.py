@@ -173,14 +173,14 @@ class Mixture:
         drawn = np.array([episode_part(seed, weights) for seed in seeds], int)
         actors: list[tuple[NDArray[np.intp], Actor]] = []
         for part, (_, policy) in enumerate(self.parts):
-            lanes = np.flatnonzero(drawn == part)
-            actors.append((lanes, policy.begin(task, [seeds[int(lane)] for lane in lanes])))
+            indices = np.flatnonzero(drawn == part)
+            actors.append((indices, policy.begin(task, [seeds[int(index)] for index in indices])))
 
         def act(observation: Array) -> NDArray[Any]:
             actions = np.empty((len(observation), task.action_size))
-            for lanes, part in actors:
-                if len(lanes):
-                    actions[lanes] = part(observation[lanes])
+            for indices, part in actors:
+                if len(indices):
+                    actions[indices] = part(observation[indices])
             return actions
 
         return act

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collecting.shards import LANES
+from jbrep.collecting.shards import NUM_ENVS
 from jbrep.dataset import Dataset, DataSettings, Episode
 from jbrep.dataset.manifest import (
     Manifest,
 )
-from jbrep.envs.lanes import Lanes
+from jbrep.envs.environments import Environments
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Read, Recording, Tick, open_loop, read_nothing, read_states, record
 from jbrep.errors import InputError
@@ -35,14 +35,14 @@ def replay_problems(
         raise InputError(f"episodes of {dataset.folder} can't be replayed: {reason}")
     numbers = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
     chosen = [dataset.episode(int(number)) for number in numbers]
-    lanes = LANES if is_batched(dataset.task) else 1
+    size = NUM_ENVS if is_batched(dataset.task) else 1
     read = read_states if settings.store_state else read_nothing
     with Progress(total=sum(map(len, chosen)), unit="step", unit_scale=True, leave=False) as bar:
-        for first in range(0, episodes, lanes):
-            some = chosen[first : first + lanes]
+        for first in range(0, episodes, size):
+            some = chosen[first : first + size]
             recording = simulate_again(some, read, bar.update, num_threads)
-            for lane, episode in enumerate(some):
-                if not _is_equal(recording, lane, episode):
+            for index, episode in enumerate(some):
+                if not _is_equal(recording, index, episode):
                     what = f"{dataset.folder}: episode {episode.number} simulated again differs"
                     yield f"{what}: {why_otherwise(dataset.manifest)}"
 
@@ -68,34 +68,34 @@ def why_otherwise(manifest: Manifest) -> str:
 def simulate_again(
     episodes: Sequence[Episode], read: Read, tick: Tick, num_threads: int | None = None
 ) -> Recording:
-    """Play episodes of one data set again, one in each lane, which then gets other actions."""
+    """Play episodes of one data set again, one in each environment, then with other actions."""
     dataset = episodes[0].dataset
     if dataset.manifest.settings.is_imported:
         raise InputError("imported episodes can't be simulated again")
     task = dataset.task
     middle = (np.array(task.action_low) + np.array(task.action_high)) / 2
     actions = np.tile(middle, (max(map(len, episodes)), len(episodes), 1))
-    for lane, episode in enumerate(episodes):
-        actions[: len(episode), lane] = episode["action"]
+    for index, episode in enumerate(episodes):
+        actions[: len(episode), index] = episode["action"]
     afterwards = repeat(np.tile(middle, (len(episodes), 1)))
-    with Lanes(task, len(episodes), num_threads) as lanes:
-        lanes.reset(range(len(episodes)), [int(episode.record["seed"]) for episode in episodes])
-        return record(lanes, open_loop(chain(actions, afterwards)), tick, read)
+    with Environments(task, len(episodes), num_threads) as envs:
+        envs.reset(range(len(episodes)), [int(episode.record["seed"]) for episode in episodes])
+        return record(envs, open_loop(chain(actions, afterwards)), tick, read)
 
 
-def _is_equal(recording: Recording, lane: int, episode: Episode) -> bool:
+def _is_equal(recording: Recording, index: int, episode: Episode) -> bool:
     length, stored = len(episode), episode.record
-    ends_there = recording.length[lane] == length and bool(recording.terminated[lane])
-    if recording.length[lane] < length or ends_there != bool(stored["terminated"]):
+    ends_there = recording.length[index] == length and bool(recording.terminated[index])
+    if recording.length[index] < length or ends_there != bool(stored["terminated"]):
         return False
     pairs: list[tuple[Any, Any]] = []
     if not episode.dataset.manifest.settings.reward:  # or else the environment gives others
-        pairs.append((recording.reward[:length, lane], episode["reward"]))
+        pairs.append((recording.reward[:length, index], episode["reward"]))
     states: dict[str, NDArray[Any]] = {"observation": recording.observation, **recording.arrays}
     for name, values in states.items():
-        pairs.append((values[:length, lane], episode[name]))
-        pairs.append((values[length, lane], stored[f"final_{name}"]))
+        pairs.append((values[:length, index], episode[name]))
+        pairs.append((values[length, index], stored[f"final_{name}"]))
     for name, values in recording.start.items():
         column = f"initial_{name}" if name in episode.dataset.task.state else name
-        pairs.append((values[lane], stored[column]))
+        pairs.append((values[index], stored[column]))
     return all(a.dtype == b.dtype and a.tobytes() == b.tobytes() for a, b in pairs)

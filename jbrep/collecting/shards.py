@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from jbrep.collecting.policies import Policy
 from jbrep.dataset.manifest import Manifest, commit, open_shard
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined, some_episodes
-from jbrep.envs.lanes import EnvironmentFailedError, Lanes, Retries
+from jbrep.envs.environments import EnvironmentFailedError, Environments, Retries
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Recording, Tick, read_nothing, read_states, record
 from jbrep.errors import InputError
 
-LANES = 100  # of a batch
+NUM_ENVS = 100  # of a batch
 SHARD_ROWS = 20_000  # of a shard of the usual size, unless a batch makes it
 
 Array = NDArray[Any]
@@ -75,7 +75,7 @@ class Simulator:
 
     settings: DataSettings
     policy: Policy  # of the settings
-    lanes: int = LANES  # environments of a batch, stepped at once
+    num_envs: int = NUM_ENVS  # environments of a batch, stepped at once
     num_threads: int | None = None  # to step a batch on; None takes one for each core
     retries: int = 0  # how often an episode in which the environment fails is played again
 
@@ -93,8 +93,8 @@ class Simulator:
         """The columns of episodes of a shard, some at a time, while rows are wanted."""
         episodes = np.array(shard)
         longest, retries = self.settings.task.max_episode_steps, Retries(self.retries)
-        # one in each lane; other environments than a batch would wait for the longest episode
-        most = self.lanes if is_batched(self.settings.task) else 1
+        # one in each environment; those that aren't a batch would wait for the longest episode
+        most = self.num_envs if is_batched(self.settings.task) else 1
 
         def at_once() -> int:
             return min(most, math.ceil(min(wanted() / longest, len(episodes))))
@@ -102,9 +102,9 @@ class Simulator:
         has_failed = False
         while (size := at_once()) > 0:
             try:
-                with Lanes(self.settings.task, size, self.num_threads) as lanes:
+                with Environments(self.settings.task, size, self.num_threads) as envs:
                     while at_once() == size:
-                        columns = self._simulate(episodes[:size], lanes, tick)
+                        columns = self._simulate(episodes[:size], envs, tick)
                         retries.succeeded()
                         episodes = episodes[size:]
                         yield columns
@@ -114,13 +114,13 @@ class Simulator:
                 has_failed = True
                 retries.failed(error)
 
-    def _simulate(self, episodes: Array, lanes: Lanes, tick: Tick) -> Columns:
+    def _simulate(self, episodes: Array, envs: Environments, tick: Tick) -> Columns:
         task = self.settings.task
         seeds = self.settings.seeds(episodes)
-        lanes.reset(range(lanes.num_lanes), seeds.tolist())
+        envs.reset(range(envs.num_envs), seeds.tolist())
         act = self.policy.begin(task, seeds.tolist())
         recording = record(
-            lanes,
+            envs,
             lambda observation: act(observation).astype(np.float32),  # as it is stored
             tick,
             read_states if self.settings.store_state else read_nothing,
@@ -128,7 +128,7 @@ class Simulator:
         return self._columns(recording, episodes, seeds)
 
     def _columns(self, recording: Recording, episodes: Array, seeds: Array) -> Columns:
-        task, length, lanes = self.settings.task, recording.length, np.arange(len(episodes))
+        task, length, indices = self.settings.task, recording.length, np.arange(len(episodes))
         seen: dict[str, Array] = {"observation": recording.observation, **recording.arrays}
         steps: dict[str, Array] = {"action": recording.action, "reward": recording.reward, **seen}
         kept = np.arange(len(recording.reward)) < length[:, None]
@@ -139,7 +139,7 @@ class Simulator:
             "missing": recording.missing,
             **{f"initial_{name}": recording.start[name] for name in task.state},
             **{name: recording.start[name] for name in task.constants},
-            **{f"final_{name}": values[length, lanes] for name, values in seen.items()},
+            **{f"final_{name}": values[length, indices] for name, values in seen.items()},
         }
         known |= {EPISODES + name: values for name, values in once.items()}
         return self.settings.columns(known)

@@ -1,4 +1,4 @@
-"""The stable-baselines3 environment: many lanes of a task, observed in full or by an encoder."""
+"""The environments of stable-baselines3, observed in full or by an encoder."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from jbrep.encoders.base import BaseEncoder, Float32, as_encoder
-from jbrep.envs.autoreset import AutoresetLanes
+from jbrep.envs.autoreset import AutoresetEnvironments
 from jbrep.envs.description import describe
-from jbrep.envs.lanes import State, check_actions
+from jbrep.envs.environments import State, check_actions
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 
@@ -29,22 +29,22 @@ def agent_spaces(
 
 
 class JitterbugVecEnv(VecEnv):
-    """Many lanes of a task for stable-baselines3, stepped together where that is possible.
+    """Many environments of a task for stable-baselines3, stepped together where that is possible.
 
     Observations are float32, scaled by the task's usual ranges, or else the latents of an encoder,
     which gets them in physical units. Actions are scaled to [-1, 1] from their bounds.
 
-    The first episode of lane i has the seed `seed + i`, as in a Gymnasium environment; episode k
+    The first episode of environment i has the seed `seed + i`, as Gymnasium has it; episode k
     from 1 on has a number below 2^31 drawn from (seed + i, k), so that each episode can be played
     again by itself.
 
     Args:
         task: a task, or the name or id of one.
-        num_envs: the number of lanes.
-        seed: of the first lane.
+        num_envs: the number of environments.
+        seed: of the first environment.
         encoder: a `jbrep.encoders.Encoder`, or a user's own (see `jbrep.encoders.base.OwnEncoder`);
             None gives the full observation.
-        num_threads: threads to step the lanes on; None takes one for each core.
+        num_threads: threads to step the environments on; None takes one for each core.
         max_episode_steps: the time limit of a task given by its name [steps].
         action_repeat: control steps for which each action is held, fewer where an episode ends
             before; a step of the environment, whose reward is their sum.
@@ -53,7 +53,7 @@ class JitterbugVecEnv(VecEnv):
 
     Attributes:
         task: the task.
-        lanes: the episodes under way.
+        envs: the episodes under way.
 
     When an episode ends, `infos[i]` holds `terminal_observation` and `TimeLimit.truncated`, whether
     it ended without a terminal state, and `control_steps`, its length; the Jitterbug's also
@@ -83,22 +83,22 @@ class JitterbugVecEnv(VecEnv):
             raise InputError(f"{task.name} is described with its time limit: describe it anew")
         self.task = task
         self._encoder = None if encoder is None else as_encoder(encoder, task)
-        self._robots = AutoresetLanes(task, num_envs, num_threads, action_repeat, retries)
-        self.lanes = self._robots.lanes
+        self._robots = AutoresetEnvironments(task, num_envs, num_threads, action_repeat, retries)
+        self.envs = self._robots.envs
         observation_space, action_space = agent_spaces(task, self._encoder)
         self._actions = np.zeros((num_envs, task.action_size))
         super().__init__(num_envs, observation_space, action_space)
         self.seed(seed)
 
     def reset(self) -> Float32:
-        """Start an episode in every lane: the first one if seeds were set since, else the next."""
+        """Start an episode in each: the first one if seeds were set since, else the next."""
         observation = self._robots.reset(self._seeds)
         self._reset_seeds()
         self._reset_options()
         return self._represent(observation)
 
     def restart(self) -> Float32:
-        """Start the episodes of now once more, as after others were played in their lanes."""
+        """Start the episodes of now once more, as after others were played instead."""
         return self._represent(self._robots.restart())
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
@@ -111,18 +111,18 @@ class JitterbugVecEnv(VecEnv):
         if moved.ended.any():
             ended = np.flatnonzero(moved.ended).tolist()
             finals = self._represent(moved.final[ended])
-            for lane, final in zip(ended, finals, strict=True):
-                infos[lane] = {
+            for index, final in zip(ended, finals, strict=True):
+                infos[index] = {
                     "terminal_observation": final,
-                    "TimeLimit.truncated": not moved.terminated[lane],
-                    **moved.told(lane),
+                    "TimeLimit.truncated": not moved.terminated[index],
+                    **moved.told(index),
                 }
         reward = moved.reward.astype(np.float32)
         return self._represent(moved.observation), reward, moved.ended, infos
 
     @property
     def state(self) -> State:
-        """A copy of what `restore` takes: everything that decides how the lanes continue."""
+        """A copy of what `restore` takes: everything that decides how the environments continue."""
         return self._robots.state
 
     def restore(self, state: State) -> None:
@@ -135,7 +135,7 @@ class JitterbugVecEnv(VecEnv):
         return self._encoder.encode(observation.astype(np.float32))
 
     def close(self) -> None:
-        self.lanes.close()
+        self.envs.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]

@@ -139,19 +139,19 @@ class EncodedVectorEnv(Encoded, VectorWrapper[Float32, Any, Any, Any, Any]):
         return self._encode(self._rows(observation)), reward, terminated, truncated, infos
 
     def _finals(self, finals: Any, ended: NDArray[np.bool_]) -> NDArray[Any]:
-        """The latent of each lane that ended, (n,) of objects as Gymnasium gives them."""
-        represented, lanes = np.full(len(ended), None, object), np.flatnonzero(ended).tolist()
-        if lanes:
-            latents = self._encode(np.stack([self._flat(finals[lane]) for lane in lanes]))
-            for lane, latent in zip(lanes, latents, strict=True):
-                represented[lane] = latent
+        """The latent of each environment that ended, (n,) of objects as Gymnasium gives them."""
+        represented, indices = np.full(len(ended), None, object), np.flatnonzero(ended).tolist()
+        if indices:
+            latents = self._encode(np.stack([self._flat(finals[index]) for index in indices]))
+            for index, latent in zip(indices, latents, strict=True):
+                represented[index] = latent
         return represented
 
     def _rows(self, observation: Any) -> NDArray[Any]:
         if isinstance(self.env.single_observation_space, spaces.Box):
             return observation.reshape(len(observation), -1)
         each = iterate(self.env.observation_space, observation)
-        return np.stack([self._flat(lane) for lane in each])
+        return np.stack([self._flat(one) for one in each])
 
 
 def _described(env: Any) -> Task:

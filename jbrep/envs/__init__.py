@@ -1,4 +1,4 @@
-"""Tasks and their environments, many of them stepped in lanes; no robot and no encoder."""
+"""Tasks and their environments, many of them stepped at once; no robot and no encoder."""
 
 from typing import TYPE_CHECKING
 
@@ -6,7 +6,7 @@ from jbrep.lazy import exports
 
 if TYPE_CHECKING:
     from jbrep.envs.description import describe as describe
-    from jbrep.envs.lanes import Lanes as Lanes
+    from jbrep.envs.environments import Environments as Environments
     from jbrep.envs.task import Feature as Feature
     from jbrep.envs.task import Task as Task
 

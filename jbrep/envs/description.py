@@ -12,7 +12,7 @@ from msgspec.structs import asdict
 
 from jbrep.envs.aside import aside
 from jbrep.envs.domain import PHYSICS, SIGNALS, Domain, read_ranges
-from jbrep.envs.lanes import Lanes
+from jbrep.envs.environments import Environments
 from jbrep.envs.make import creator, give_back, is_batched, take
 from jbrep.envs.names import absolute, code_of, files_of, find_spec, spec_of, taken_for
 from jbrep.envs.physics import can_be_pushed, physics_of
@@ -215,13 +215,13 @@ def _spread(plain: str) -> tuple[float, ...]:
     several = _SPREAD_EPISODES if is_batched(task) else 1
     low, high = task.action_low, task.action_high
     seen = []
-    with Lanes(task, several) as lanes:
+    with Environments(task, several) as envs:
         for first in range(0, _SPREAD_EPISODES, several):
             seeds = range(first, first + several)
             randoms = [np.random.default_rng(seed) for seed in seeds]
-            seen.append(lanes.reset(range(several), seeds))
-            while lanes.num_active:
-                active = lanes.active
-                step = lanes.step([random.uniform(low, high) for random in randoms])
+            seen.append(envs.reset(range(several), seeds))
+            while envs.num_active:
+                active = envs.active
+                step = envs.step([random.uniform(low, high) for random in randoms])
                 seen.append(step.observation[active])
     return tuple(np.concatenate(seen).std(axis=0).tolist())

@@ -17,18 +17,18 @@ _OPTIONS = ("friction", "mass", "body")  # of a batch that has them, when it is 
 
 
 class Disturbed:
-    """A batch of environments, as `Lanes` steps one, as a task's domain has it.
+    """A batch of environments, as `Environments` steps one, as a task's domain has it.
 
     What an episode draws follows from its seed, and what a step draws from its number, too. What of
     the physics is drawn, the batch does itself, or else takes it as options of `reset` and in
     `push`.
     """
 
-    def __init__(self, batch: Any, task: Task, num_lanes: int):
+    def __init__(self, batch: Any, task: Task, num_envs: int):
         assert task.domain
         self._batch, self._task, self._domain = batch, task, task.domain
         whole = task.whole
-        self._draws = Draws(num_lanes, whole.size)
+        self._draws = Draws(num_envs, whole.size)
         self._push = getattr(batch, "push", None)
         self._options = _OPTIONS[: 3 if task.domain.body else 2]
         self._spread = np.array(task.domain.spread or np.zeros(whole.size))
@@ -36,32 +36,32 @@ class Disturbed:
         self._turns = np.flatnonzero(turns)
         self._low = np.array([f.low for f in whole.features if f.is_full_turn])
         self._rest, delays = whole.rest, (task.domain.delay[1], task.domain.action_delay[1])
-        self._drawn: dict[str, Array] = {n: np.zeros(num_lanes) for n in Drawn._fields}
-        self._given = np.zeros((num_lanes, whole.size))
-        self._measured = np.zeros((num_lanes, delays[0] + 1, whole.size))  # the latest first
-        self._commands = np.zeros((num_lanes, delays[1] + 1, whole.action_size))
-        self._shown = np.zeros((num_lanes, whole.size))
+        self._drawn: dict[str, Array] = {n: np.zeros(num_envs) for n in Drawn._fields}
+        self._given = np.zeros((num_envs, whole.size))
+        self._measured = np.zeros((num_envs, delays[0] + 1, whole.size))  # the latest first
+        self._commands = np.zeros((num_envs, delays[1] + 1, whole.action_size))
+        self._shown = np.zeros((num_envs, whole.size))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._batch, name)
 
     def reset(self, seed: Any, options: Mapping[str, Any]) -> tuple[Array, Any]:
-        lanes = np.flatnonzero(options["reset_mask"])
-        seeds = np.array([seed[lane] for lane in lanes], np.int64)
-        self._draws.begin(lanes, seeds)
-        self._draw(lanes, seeds)
+        indices = np.flatnonzero(options["reset_mask"])
+        seeds = np.array([seed[index] for index in indices], np.int64)
+        self._draws.begin(indices, seeds)
+        self._draw(indices, seeds)
         drawn = {name: self._drawn[name] for name in self._options} if self._push else {}
         given, info = self._batch.reset(seed=seed, options={**options, **drawn})
         self._given = given
-        self._measured[lanes] = self._measure(given)[lanes, None]
-        self._shown[lanes] = self._measured[lanes, 0]
-        self._commands[lanes] = self._rest
+        self._measured[indices] = self._measure(given)[indices, None]
+        self._shown[indices] = self._measured[indices, 0]
+        self._commands[indices] = self._rest
         return self._shown.copy(), info
 
-    def _draw(self, lanes: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
-        for lane, seed in zip(lanes.tolist(), seeds.tolist(), strict=True):
+    def _draw(self, indices: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
+        for index, seed in zip(indices.tolist(), seeds.tolist(), strict=True):
             for name, value in self._domain.draw(seed)._asdict().items():
-                self._drawn[name][lane] = 0 if value is None else value
+                self._drawn[name][index] = 0 if value is None else value
 
     def step(self, actions: Array) -> tuple[Any, ...]:
         self._draws.move()
@@ -79,7 +79,7 @@ class Disturbed:
         return self._shown.copy(), *others
 
     def _measure(self, given: Array) -> Array:
-        """What sensors say, (n, d): a lane without noise has what is given, to the bit."""
+        """What sensors say, (n, d): an environment without noise has what is given, to the bit."""
         noise = self._drawn["noise"][:, None]
         noisy = given + noise * self._spread * self._draws.normal
         turns = noisy[:, self._turns]

@@ -126,35 +126,35 @@ def read_ranges(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class Draws:
-    """Random numbers of n lanes' episodes: those of a step follow from its number and the seed.
+    """Random numbers of n episodes: those of a step follow from its number and the seed.
 
     Of each step they are normal ones, (n, d), and uniform ones.
     """
 
-    def __init__(self, num_lanes: int, size: int):
+    def __init__(self, num_envs: int, size: int):
         self._size = size
-        self._seeds = np.zeros(num_lanes, np.int64)
-        self._steps = np.zeros(num_lanes, np.int64)  # so far, in each episode
-        self._uniform = np.zeros((num_lanes, _BLOCK, 3))
-        self._normal = np.zeros((num_lanes, _BLOCK, size))
+        self._seeds = np.zeros(num_envs, np.int64)
+        self._steps = np.zeros(num_envs, np.int64)  # so far, in each episode
+        self._uniform = np.zeros((num_envs, _BLOCK, 3))
+        self._normal = np.zeros((num_envs, _BLOCK, size))
 
-    def begin(self, lanes: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
-        """Be at the first state of new episodes in some lanes."""
-        self._seeds[lanes], self._steps[lanes] = seeds, 0
-        self._fill(lanes)
+    def begin(self, indices: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
+        """Be at the first state of new episodes in some environments."""
+        self._seeds[indices], self._steps[indices] = seeds, 0
+        self._fill(indices)
 
     def move(self) -> None:
-        """Be at the next state of each lane."""
+        """Be at the next state of each environment."""
         self._steps += 1
         self._fill(np.flatnonzero(self._steps % _BLOCK == 0))
 
-    def _fill(self, lanes: NDArray[np.int64]) -> None:
-        for lane in lanes.tolist():
-            block = int(self._steps[lane]) // _BLOCK
-            entropy = (_STREAM, int(self._seeds[lane]))
+    def _fill(self, indices: NDArray[np.int64]) -> None:
+        for index in indices.tolist():
+            block = int(self._steps[index]) // _BLOCK
+            entropy = (_STREAM, int(self._seeds[index]))
             random = np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(block,)))
-            self._uniform[lane] = random.random((_BLOCK, 3))
-            self._normal[lane] = random.standard_normal((_BLOCK, self._size))
+            self._uniform[index] = random.random((_BLOCK, 3))
+            self._normal[index] = random.standard_normal((_BLOCK, self._size))
 
     @property
     def normal(self) -> Array:
@@ -169,7 +169,7 @@ class Draws:
     def pushes(self, speeds: Array) -> Array:
         """The velocities of the pushes of now, zeros where there is none, (n, 3) [m/s].
 
-        Each lane's pushes have its speed, (n,).
+        Each environment's pushes have its speed, (n,).
         """
         _, chance, turn = self._now(self._uniform).T
         pushed = np.where(chance < _PUSHES, speeds, 0)

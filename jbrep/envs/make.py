@@ -45,12 +45,12 @@ def make_env(
         return gymnasium.make(spec, disable_env_checker=True, **{**arguments, **options})
 
 
-def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:
-    """All lanes as one environment that steps them together, see `is_batched`."""
+def make_batch(task: Task, num_envs: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:
+    """All of them as one environment that steps them together, see `is_batched`."""
     with _making(task.id, task.arguments):
         return gymnasium.make_vec(
             spec_of(task),
-            num_envs=num_lanes,
+            num_envs=num_envs,
             vectorization_mode="vector_entry_point",
             autoreset_mode=AutoresetMode.DISABLED,
             max_episode_steps=task.max_episode_steps,
@@ -68,13 +68,13 @@ def _making(env_id: str, arguments: Mapping[str, Any]) -> Iterator[None]:
 
 
 def is_batched(task: Task) -> bool:
-    """Whether the environment steps many lanes faster together than one by one.
+    """Whether many environments are stepped faster together than one by one.
 
     That is so if the registered vector entry point is a class that says so: one with a true
-    attribute `resets_lanes`, the arguments num_threads, dtype and autoreset_mode, and a `reset`
+    attribute `resets_envs`, the arguments num_threads, dtype and autoreset_mode, and a `reset`
     that takes the option `reset_mask`.
     """
-    return getattr(creator(spec_of(task), vector=True), "resets_lanes", False)
+    return getattr(creator(spec_of(task), vector=True), "resets_envs", False)
 
 
 def is_one_robot(task: Task, threads: int | None) -> bool:

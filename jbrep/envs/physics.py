@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jbrep.envs.task import Array
 
 if TYPE_CHECKING:
-    from jbrep.envs.lanes import Lanes
+    from jbrep.envs.environments import Environments
     from jbrep.envs.recording import Recording
 
 FRICTIONS, MASSES = ("geom_friction", "pair_friction"), ("body_mass", "body_inertia")
@@ -195,30 +195,32 @@ class Motion:
 
 
 class MotionReader:
-    """Reads the physics of lanes while `jbrep.envs.recording.record` plays their next episodes.
+    """Reads the physics while `jbrep.envs.recording.record` plays the next episodes.
 
-    Known are the environments of `physics_of`, and batches that give the `models` of their lanes
+    Known are the environments of `physics_of`, and batches that give their `models`
     and their `mujoco_state`, arrays of `mujoco.MjData` by name, (n, ...) each.
     """
 
     def __init__(self) -> None:
         self._models: list[mujoco.MjModel] = []
 
-    def __call__(self, lanes: "Lanes") -> Mapping[str, Array]:
-        """The state of each lane, (n, ...) each; nothing where there is no MuJoCo."""
-        if hasattr(lanes.envs, "mujoco_state"):
-            self._models = self._models or lanes.envs.models
-            return lanes.envs.mujoco_state
-        running = [physics_of(env) for env in lanes.envs] if isinstance(lanes.envs, list) else []
+    def __call__(self, envs: "Environments") -> Mapping[str, Array]:
+        """The state of each environment, (n, ...) each; nothing where there is no MuJoCo."""
+        if hasattr(envs.instances, "mujoco_state"):
+            self._models = self._models or envs.instances.models
+            return envs.instances.mujoco_state
+        running = (
+            [physics_of(env) for env in envs.instances] if isinstance(envs.instances, list) else []
+        )
         every = [physics for physics in running if physics]
-        if len(every) < lanes.num_lanes or len({p.model.nq for p in every}) > 1:
+        if len(every) < envs.num_envs or len({p.model.nq for p in every}) > 1:
             return {}
         self._models = self._models or [physics.model for physics in every]
         return {name: np.stack([getattr(p.data, name) for p in every]) for name in _STATE}
 
-    def motion(self, recording: "Recording", lane: int, steps: int) -> Motion | None:
-        """What the robot of a lane went through in its first steps; None without MuJoCo."""
+    def motion(self, recording: "Recording", index: int, steps: int) -> Motion | None:
+        """What the robot of an environment went through in its first steps; None without MuJoCo."""
         if not recording.arrays:
             return None
         read = recording.arrays.items()
-        return Motion(self._models[lane], {n: values[: steps + 1, lane] for n, values in read})
+        return Motion(self._models[index], {n: values[: steps + 1, index] for n, values in read})

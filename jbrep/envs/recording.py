@@ -1,4 +1,4 @@
-"""Episodes: lanes stepped under a policy until every episode has ended, and recorded."""
+"""Episodes: environments stepped under a policy until every episode has ended, and recorded."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -8,40 +8,42 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.envs.environments import Environments, Step
 from jbrep.envs.infos import Numbers
-from jbrep.envs.lanes import Lanes, Step
 from jbrep.envs.task import Array
 
 _Seen = TypeVar("_Seen", bound=NDArray[Any])
 Actor = Callable[[Array], NDArray[Any]]  # observations (n, d) to actions (n, k), once for each step
-Tick = Callable[[int], object]  # called with the number of steps just made, over all lanes
-Read = Callable[[Lanes], Mapping[str, Array]]  # of the lanes as they are, (n, ...) each
+Tick = Callable[[int], object]  # called with the number of steps just made, over all environments
+Read = Callable[
+    [Environments], Mapping[str, Array]
+]  # of the environments as they are, (n, ...) each
 
 
 class Played(NamedTuple):
-    """A step of n lanes, and what came before it."""
+    """A step of n environments, and what came before it."""
 
     observation: Array  # before it, (n, d)
     action: NDArray[Any]  # (n, k)
-    active: NDArray[np.bool_]  # the lanes whose episode went on, (n,)
+    active: NDArray[np.bool_]  # the environments whose episode went on, (n,)
     step: Step
 
 
-def play(lanes: Lanes, act: Actor) -> Iterator[Played]:
-    """Step lanes until every episode has ended; while a step is yielded, they are where it led."""
-    while lanes.num_active:
-        observation, active = lanes.observation, lanes.active
+def play(envs: Environments, act: Actor) -> Iterator[Played]:
+    """Step until every episode has ended; while a step is yielded, they are where it led."""
+    while envs.num_active:
+        observation, active = envs.observation, envs.active
         action = act(observation)
-        yield Played(observation, action, active, lanes.step(action))
+        yield Played(observation, action, active, envs.step(action))
 
 
 def held(
     act: Callable[[_Seen], NDArray[Any]], repeat: int, chunk: int = 1
 ) -> Callable[[_Seen], NDArray[Any]]:
-    """The actor that lets another choose actions and holds each for so many steps in all lanes.
+    """The actor that lets another choose actions, and holds each for so many steps.
 
     It chooses `chunk` of them at once, (..., chunk * k), which are played one after the other.
-    Lanes must be at the start of their episodes when it first acts.
+    Environments must be at the start of their episodes when it first acts.
     """
     upcoming: list[NDArray[Any]] = []
 
@@ -61,21 +63,21 @@ def open_loop(actions: Iterable[NDArray[Any]]) -> Actor:
     return lambda observation: next(remaining)
 
 
-def read_nothing(lanes: Lanes) -> Mapping[str, Array]:
+def read_nothing(envs: Environments) -> Mapping[str, Array]:
     """Record observations and rewards alone."""
     return {}
 
 
-def read_states(lanes: Lanes) -> Mapping[str, Array]:
+def read_states(envs: Environments) -> Mapping[str, Array]:
     """Record what moves of the task's arrays, too."""
-    return {name: lanes.arrays[name] for name in lanes.task.state}
+    return {name: envs.arrays[name] for name in envs.task.state}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording:
-    """What n lanes went through in T steps; the first axis is time.
+    """What n environments went through in T steps; the first axis is time.
 
-    A lane whose episode ended early stands still: its rows from `length` on mean nothing.
+    An environment whose episode ended early stands still: its rows from `length` on mean nothing.
     """
 
     start: Mapping[str, Array]  # the task's arrays before the first step, (n, width) each
@@ -89,17 +91,17 @@ class Recording:
     missing: NDArray[np.int64]  # readings for which the one before stands, or the end, (n,)
 
 
-def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = read_nothing) -> Recording:
-    """Play the episodes that the lanes are at the start of, and record them."""
-    start, reads = _copied(lanes.arrays), [_copied(read(lanes))]
-    observations = [lanes.observation]
+def record(envs: Environments, act: Actor, tick: Tick, read: Read = read_nothing) -> Recording:
+    """Play the episodes that the environments are at the start of, and record them."""
+    start, reads = _copied(envs.arrays), [_copied(read(envs))]
+    observations = [envs.observation]
     actives, actions, rewards = [], [], []
-    for played in play(lanes, act):
+    for played in play(envs, act):
         observations.append(played.step.observation)
-        actives.append(played.active & ~lanes.lost)
+        actives.append(played.active & ~envs.lost)
         actions.append(played.action)
         rewards.append(played.step.reward)
-        reads.append(_copied(read(lanes)))
+        reads.append(_copied(read(envs)))
         tick(int(np.count_nonzero(played.active)))
     return Recording(
         start=start,
@@ -107,10 +109,10 @@ def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = read_nothing) -> R
         arrays={name: np.stack([each[name] for each in reads]) for name in reads[0]},
         action=np.stack(actions),
         reward=np.stack(rewards).astype(np.float32),
-        terminated=lanes.terminated,
-        truncated=lanes.truncated,
+        terminated=envs.terminated,
+        truncated=envs.truncated,
         length=np.stack(actives).sum(axis=0, dtype=np.int32),
-        missing=lanes.missing.copy(),
+        missing=envs.missing.copy(),
     )
 
 
@@ -132,30 +134,30 @@ def joined(outcomes: Iterable[Outcome], count: int | None = None) -> Outcome:
 
 
 def outcome(
-    lanes: Lanes, act: Actor, first_seed: int = 0, tick: Tick = lambda steps: None
+    envs: Environments, act: Actor, first_seed: int = 0, tick: Tick = lambda steps: None
 ) -> Outcome:
-    """What comes of one whole episode in each lane under a policy.
+    """What comes of one whole episode in each environment under a policy.
 
-    Lane i starts like a Gymnasium environment reset with `first_seed` + i.
+    Environment i starts like a Gymnasium environment reset with `first_seed` + i.
     """
-    lanes.reset(range(lanes.num_lanes), range(first_seed, first_seed + lanes.num_lanes))
-    total = np.zeros(lanes.num_lanes)
-    for played in play(lanes, act):
+    envs.reset(range(envs.num_envs), range(first_seed, first_seed + envs.num_envs))
+    total = np.zeros(envs.num_envs)
+    for played in play(envs, act):
         total += played.step.reward
         tick(int(played.active.sum()))
-    return Outcome(total, lanes.numbers)
+    return Outcome(total, envs.numbers)
 
 
-def episode_returns(lanes: Lanes, act: Actor, first_seed: int = 0) -> Array:
+def episode_returns(envs: Environments, act: Actor, first_seed: int = 0) -> Array:
     """The returns of `outcome`, (n,)."""
-    return outcome(lanes, act, first_seed).returns
+    return outcome(envs, act, first_seed).returns
 
 
 def whole_outcome(
-    lanes: Lanes, begin: Callable[[], Actor], first_seed: int, tick: Tick = lambda steps: None
+    envs: Environments, begin: Callable[[], Actor], first_seed: int, tick: Tick = lambda steps: None
 ) -> Outcome:
     """As `outcome`; episodes in which the environment failed are begun and played again."""
     while True:
-        found = outcome(lanes, begin(), first_seed, tick)
-        if not lanes.has_failed:
+        found = outcome(envs, begin(), first_seed, tick)
+        if not envs.has_failed:
             return found

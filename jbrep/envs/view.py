@@ -37,26 +37,26 @@ class Window:
 
     Args:
         task: with a view.
-        num_lanes: n.
+        num_envs: n.
         places: where the features that are seen stand in what is given, of D numbers.
     """
 
-    def __init__(self, task: Task, num_lanes: int, places: Sequence[int]):
+    def __init__(self, task: Task, num_envs: int, places: Sequence[int]):
         view = task.view
         assert view
         self._places = np.array(places)
-        self._states = np.zeros((num_lanes, view.history, len(self._places)))
+        self._states = np.zeros((num_envs, view.history, len(self._places)))
         self._rest = task.rest
-        self._actions = np.zeros((num_lanes, view.history - 1, task.action_size))
+        self._actions = np.zeros((num_envs, view.history - 1, task.action_size))
 
-    def begin(self, lanes: Sequence[int] | NDArray[np.int64], given: NDArray[Any]) -> Array:
-        """What is seen in all lanes, (n, d), after an episode began in some; given is (n, D)."""
-        self._states[lanes] = given[lanes][:, None, self._places]
-        self._actions[lanes] = self._rest
+    def begin(self, indices: Sequence[int] | NDArray[np.int64], given: NDArray[Any]) -> Array:
+        """What is seen in all, (n, d), after an episode began in some; given is (n, D)."""
+        self._states[indices] = given[indices][:, None, self._places]
+        self._actions[indices] = self._rest
         return self._seen()
 
     def step(self, moved: NDArray[np.bool_], actions: NDArray[Any], given: NDArray[Any]) -> Array:
-        """What is seen in all lanes, (n, d), after a step of those that moved, (n,)."""
+        """What is seen in all environments, (n, d), after a step of those that moved, (n,)."""
         for past, now in ((self._states, given[:, self._places]), (self._actions, actions)):
             if past.shape[1]:
                 past[moved, 1:] = past[moved, :-1]
@@ -69,12 +69,12 @@ class Window:
 
 
 class Seen:
-    """A batch of environments, as `Lanes` steps one, of which a task's view is seen."""
+    """A batch of environments, as `Environments` steps one, of which a task's view is seen."""
 
-    def __init__(self, batch: Any, task: Task, num_lanes: int):
+    def __init__(self, batch: Any, task: Task, num_envs: int):
         assert task.view
         self._batch = batch
-        self._window = Window(task, num_lanes, task.view.places)
+        self._window = Window(task, num_envs, task.view.places)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._batch, name)

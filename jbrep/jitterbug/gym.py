@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from jbrep.envs.lanes import check_actions
+from jbrep.envs.environments import check_actions
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError, choose
 from jbrep.jitterbug.bodies import check_body
@@ -180,11 +180,11 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """Many Jitterbugs stepped together; what `gymnasium.make_vec` gives.
 
-    Lane i of an environment that is reset with seed s has the episodes of a single environment
-    reset with seed s + i. Infos hold `qpos`, `qvel`, `target_position` and `target_quaternion` of
-    each lane's state, and the number of its `body`, -1 for the published one.
+    Reset with seed s, robot i has the episodes of a single environment reset with seed s + i. Infos
+    hold `qpos`, `qvel`, `target_position` and `target_quaternion` of each robot's state, and the
+    number of its `body`, -1 for the published one.
 
-    Options of `reset` may have the `body`, `friction` and `mass` of each lane that it starts, (n,)
+    Options of `reset` may have the `body`, `friction` and `mass` of each robot that it starts, (n,)
     each: a number, and factors of what the model has.
 
     Args:
@@ -192,14 +192,14 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         num_envs: how many robots.
         max_episode_steps: the time limit, in control steps.
         num_threads: threads to step them on; None takes one for each core.
-        autoreset_mode: SAME_STEP, which resets a lane in the step that ends its episode, or
+        autoreset_mode: SAME_STEP, which resets an environment in the step that ends its episode, or
             DISABLED, which leaves it to `reset` with `options={"reset_mask": ...}`.
         dtype: of observations, float32 or float64.
     """
 
     changeable = ("friction", "mass", "push", "body")  # by a domain, see `jbrep.envs.domain`
 
-    resets_lanes = True  # as `jbrep.envs.make.is_batched` asks
+    resets_envs = True  # as `jbrep.envs.make.is_batched` asks
 
     def __init__(
         self,
@@ -240,28 +240,30 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode in every lane, or where the option `reset_mask`, (n,), is true.
+        """Start an episode in every environment, or where the option `reset_mask`, (n,), is true.
 
-        A lane without a seed draws from its generator as it is.
+        An environment without a seed draws from its generator as it is.
         """
         if seed is None or isinstance(seed, int | np.integer):
-            seed = [None if seed is None else seed + lane for lane in range(self.num_envs)]
+            seed = [None if seed is None else seed + index for index in range(self.num_envs)]
         if len(seed) != self.num_envs:
-            raise InputError(f"{len(seed)} seeds for {self.num_envs} lanes: give one for each lane")
+            raise InputError(
+                f"{len(seed)} seeds for {self.num_envs} environments: give one for each environment"
+            )
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
-        lanes = np.flatnonzero(mask).tolist()
-        for lane in lanes:
-            if (number := seed[lane]) is not None:
-                self._generators[lane] = np.random.default_rng(number)
-        self._restart(lanes, options or {})
+        indices = np.flatnonzero(mask).tolist()
+        for index in indices:
+            if (number := seed[index]) is not None:
+                self._generators[index] = np.random.default_rng(number)
+        self._restart(indices, options or {})
         return self._view(self._observation), self._info()
 
     def step(
         self, actions: NDArray[np.floating]
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """One control step in every lane.
+        """One control step in every environment.
 
-        A lane whose physics diverges is truncated with its last finite observation, reward 0 and
+        A robot whose physics diverges is truncated with its last finite observation, reward 0 and
         `non_finite` true in its info.
         """
         diverged = self.simulation.step(check_actions(actions, self.num_envs, 1))
@@ -274,12 +276,12 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         self._observation = observation
         info: dict[str, Any] = {}
         if self._resets and truncated.any():
-            for lane in np.flatnonzero(truncated).tolist():
+            for index in np.flatnonzero(truncated).tolist():
                 final = {
-                    "final_obs": self._view(observation[lane]),
-                    "final_info": {"non_finite": bool(diverged[lane])},
+                    "final_obs": self._view(observation[index]),
+                    "final_info": {"non_finite": bool(diverged[index])},
                 }
-                info = self._add_info(info, final, lane)
+                info = self._add_info(info, final, index)
             self._restart(np.flatnonzero(truncated).tolist())
         terminated = np.zeros(self.num_envs, dtype=np.bool_)
         info |= self._info(non_finite=diverged)
@@ -287,12 +289,12 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
 
     @property
     def models(self) -> list[mujoco.MjModel]:
-        """The model of each lane's robot, as described."""
-        return [self.simulation.model_of(lane) for lane in range(self.num_envs)]
+        """The model of each environment's robot, as described."""
+        return [self.simulation.model_of(index) for index in range(self.num_envs)]
 
     @property
     def mujoco_state(self) -> dict[str, Array]:
-        """What pictures of the lanes follow from: arrays of `mujoco.MjData`, (n, ...) each."""
+        """What pictures follow from: arrays of `mujoco.MjData`, (n, ...) each."""
         return self.simulation.mujoco_state
 
     def look(self) -> Array:
@@ -303,21 +305,21 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
     def push(self, velocity: Array) -> None:
         self.simulation.push(velocity)
 
-    def _restart(self, lanes: Sequence[int], options: Mapping[str, Any] = {}) -> None:
+    def _restart(self, indices: Sequence[int], options: Mapping[str, Any] = {}) -> None:
         usual = np.ones(self.num_envs)
         factors = [options.get(name, usual) for name in ("friction", "mass")]
         self.simulation.reset(
-            lanes,
-            [self._generators[lane] for lane in lanes],
-            options["body"][lanes] if "body" in options else None,
-            np.stack(factors, axis=1)[lanes],
+            indices,
+            [self._generators[index] for index in indices],
+            options["body"][indices] if "body" in options else None,
+            np.stack(factors, axis=1)[indices],
         )
-        self._steps[lanes] = 0
+        self._steps[indices] = 0
         self._observation = self._observation.copy()
-        self._observation[lanes] = self.simulation.observe()[lanes]
+        self._observation[indices] = self.simulation.observe()[indices]
 
     def _info(self, **others: NDArray[Any]) -> dict[str, Any]:
-        """The state of each lane and more, as Gymnasium's vector environments give infos."""
+        """The state of each environment and more, as Gymnasium's vector environments give infos."""
         now = self.simulation.readings
         arrays = {
             "qpos": now.qpos.copy(),
@@ -327,5 +329,5 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
             "body": self.simulation.body_numbers[:, None],
             **others,
         }
-        every_lane = np.ones(self.num_envs, np.bool_)
-        return arrays | dict.fromkeys((f"_{name}" for name in arrays), every_lane)
+        every_env = np.ones(self.num_envs, np.bool_)
+        return arrays | dict.fromkeys((f"_{name}" for name in arrays), every_env)

@@ -11,7 +11,7 @@ from mujoco import _batch
 from mujoco.batch import Batch
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.envs.lanes import check_counts
+from jbrep.envs.environments import check_counts
 from jbrep.envs.physics import put_factors, turned, turned_quaternion, velocity_after
 from jbrep.envs.task import Array
 from jbrep.jitterbug import bodies
@@ -28,7 +28,7 @@ PHYSICS_STEPS = round(CONTROL_TIMESTEP / PHYSICS_TIMESTEP)  # in a control step
 _ARENA = 1 << 20  # [bytes] per robot; MuJoCo's own choice is 14 times as large
 _UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-# on a position, velocity or acceleration that isn't finite, MuJoCo warns and resets the lane
+# on a position, velocity or acceleration that isn't finite, MuJoCo warns and resets the robot
 _NOT_FINITE = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1
 )
@@ -81,13 +81,13 @@ def stop_profiling() -> None:
 
 
 class Simulation:
-    """n Jitterbugs in n lanes; what a lane does depends on its own start and actions alone.
+    """n Jitterbugs; what each does depends on its own start and actions alone.
 
-    Neither the number of lanes nor that of threads changes a bit of any trajectory.
+    Neither their number nor that of threads changes a bit of any trajectory.
 
     Args:
         task: what is observed and rewarded.
-        num_lanes: n, the number of robots.
+        num_envs: n, the number of robots.
         num_threads: threads to step them on; None takes one for each core.
         body: number of the robots' body, 0 to 2^31 - 1, "random" for another in each episode, or
             None for the published robot's; see `jbrep.jitterbug.bodies`.
@@ -95,31 +95,31 @@ class Simulation:
 
     Attributes:
         readings: what the tasks read of the current states; a new object after each step.
-        target_quaternion: of the lanes' targets, (n, 4).
+        target_quaternion: of the robots' targets, (n, 4).
     """
 
     def __init__(
         self,
         task: JitterbugTask,
-        num_lanes: int,
+        num_envs: int,
         num_threads: int | None = None,
         body: int | str | None = None,
         materials: bool = False,
     ):
-        check_counts(num_lanes, num_threads)
+        check_counts(num_envs, num_threads)
         bodies.check_body(body, materials)
         stop_profiling()
         self.task = task
-        self.num_lanes = num_lanes
+        self.num_envs = num_envs
         self._body = body
         self._materials = materials
         first = body if isinstance(body, int) else bodies.PUBLISHED
-        self._numbers = np.full(num_lanes, first, np.int64)
-        self._factors = np.ones((num_lanes, 2))  # of friction and mass
-        self._models = [fast_model(self._drawn(first))] * num_lanes
+        self._numbers = np.full(num_envs, first, np.int64)
+        self._factors = np.ones((num_envs, 2))  # of friction and mass
+        self._models = [fast_model(self._drawn(first))] * num_envs
         self._shown: dict[tuple[float, ...], mujoco.MjModel] = {}
         # persistent: a step reuses what has already been computed for the readings
-        self._batch = Batch(self._models[0], num_lanes, num_threads or 0, persistent=True)
+        self._batch = Batch(self._models[0], num_envs, num_threads or 0, persistent=True)
         self._control = self._batch.bind("ctrl")
         core = self._models[0].body("jitterbug").id
         self._warnings = self._batch.warning[:, _NOT_FINITE, 1]
@@ -129,7 +129,7 @@ class Simulation:
             self._batch.bind("xmat")[:, core],
             self._batch.bind("sensordata"),
             self._batch.bind("mocap_pos")[:, 0],
-            np.zeros((num_lanes, 2)),
+            np.zeros((num_envs, 2)),
         )
         self.target_quaternion = self._batch.bind("mocap_quat")[:, 0]
         self._warmstart = self._batch.bind("qacc_warmstart")
@@ -137,12 +137,12 @@ class Simulation:
 
     def reset(
         self,
-        lanes: Sequence[int],
+        indices: Sequence[int],
         randoms: Iterable[np.random.Generator],
         numbers: Iterable[float] | None = None,
         factors: ArrayLike = 1.0,
     ) -> None:
-        """Start an episode in each of k lanes, drawn from its own generator.
+        """Start an episode of each of k robots, drawn from its own generator.
 
         A random body doesn't change what else is drawn from the generator, now or later. Numbers,
         (k,), are those of other bodies than that of all; factors, (k, 2), of friction and mass.
@@ -150,18 +150,18 @@ class Simulation:
         randoms = list(randoms)
         if numbers is None:
             numbers = [bodies.number_of(self._body, random) for random in randoms]
-        self._put_models(lanes, numbers, np.broadcast_to(factors, (len(lanes), 2)))
-        self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        for lane, random in zip(lanes, randoms, strict=True):
+        self._put_models(indices, numbers, np.broadcast_to(factors, (len(indices), 2)))
+        self._batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        for index, random in zip(indices, randoms, strict=True):
             start = self.task.start(random)
-            self.readings.qpos[lane, QUATERNION] = start.quaternion
-            self.readings.target_position[lane] = start.target_position
-            self.target_quaternion[lane] = start.target_quaternion
-        self._forward(lanes)
+            self.readings.qpos[index, QUATERNION] = start.quaternion
+            self.readings.target_position[index] = start.target_position
+            self.target_quaternion[index] = start.target_quaternion
+        self._forward(indices)
 
     @property
     def body_numbers(self) -> Array:
-        """The number of each lane's body, -1 for the published one, (n,)."""
+        """The number of each robot's body, -1 for the published one, (n,)."""
         return self._numbers.astype(np.float64)
 
     @property
@@ -182,7 +182,7 @@ class Simulation:
 
     @property
     def mujoco_state(self) -> dict[str, Array]:
-        """What pictures of the lanes follow from: views of `mujoco.MjData`, (n, ...) each."""
+        """What pictures follow from: views of `mujoco.MjData`, (n, ...) each."""
         return {
             "qpos": self.readings.qpos,
             "qvel": self.readings.qvel,
@@ -201,23 +201,23 @@ class Simulation:
         body: Array | None = None,
         factors: Array | None = None,
     ) -> None:
-        """Put all lanes in stored states: (n, 16), (n, 15), (n, 3) and (n, 4).
+        """Put all robots in stored states: (n, 16), (n, 15), (n, 3) and (n, 4).
 
         The same actions then lead through the same states, bit for bit. After an episode's first
         state this also takes the warm start (n, 15) of MuJoCo's solver. `body` holds the numbers
         of the bodies (n,), -1 for the published robot's, and `factors` those of friction and mass,
-        (n, 2); without them, the lanes keep theirs.
+        (n, 2); without them, the robots keep theirs.
         """
-        lanes = range(self.num_lanes)
+        indices = range(self.num_envs)
         kept = self._numbers.copy() if body is None else body
-        self._put_models(lanes, kept, self._factors.copy() if factors is None else factors)
-        self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._put_models(indices, kept, self._factors.copy() if factors is None else factors)
+        self._batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE)
         self.readings.qpos[:] = qpos
         self.readings.qvel[:] = qvel
         self.readings.target_position[:] = target_position
         self.target_quaternion[:] = target_quaternion
         self._warmstart[:] = warmstart
-        self._forward(lanes)
+        self._forward(indices)
 
     def quarter_turn(self, shift: tuple[float, float]) -> None:
         """Turn robots and targets by a quarter about the vertical axis, then shift them [m]."""
@@ -233,21 +233,21 @@ class Simulation:
     def _drawn(self, number: int) -> bodies.Body | None:
         return None if number == bodies.PUBLISHED else bodies.draw(number, self._materials)
 
-    def _put_models(self, lanes: Sequence[int], numbers: Iterable[float], factors: Array) -> None:
+    def _put_models(self, indices: Sequence[int], numbers: Iterable[float], factors: Array) -> None:
         changed = False
-        for lane, number, own in zip(lanes, numbers, factors, strict=True):
-            if number != self._numbers[lane] or (own != self._factors[lane]).any():
-                self._numbers[lane], self._factors[lane] = number, own
+        for index, number, own in zip(indices, numbers, factors, strict=True):
+            if number != self._numbers[index] or (own != self._factors[index]).any():
+                self._numbers[index], self._factors[index] = number, own
                 usual = fast_model(self._drawn(int(number)))
-                self._models[lane] = self._varied(lane, usual, self._scratch)
+                self._models[index] = self._varied(index, usual, self._scratch)
                 changed = True
         if changed:
             self._batch.set_models(self._models)
             self._shown.clear()
 
-    def _varied(self, lane: int, usual: mujoco.MjModel, data: mujoco.MjData) -> mujoco.MjModel:
-        """The usual model of a lane's body with the lane's factors; itself where they are 1."""
-        friction, mass = self._factors[lane].tolist()
+    def _varied(self, index: int, usual: mujoco.MjModel, data: mujoco.MjData) -> mujoco.MjModel:
+        """The usual model of a robot's body with its factors; itself where they are 1."""
+        friction, mass = self._factors[index].tolist()
         if friction == mass == 1:
             return usual
         varied = copy.copy(usual)
@@ -260,22 +260,22 @@ class Simulation:
 
     def push(self, velocity: Array) -> None:
         """Push robots: by the impulse on each one's core by its mass, (n, 3) [m/s]; 0 is none."""
-        lanes = np.flatnonzero(velocity.any(axis=1)).tolist()
-        for lane in lanes:
-            now, scratch = self.readings.qpos[lane], self._scratch
-            added = velocity_after(self._models[lane], now, velocity[lane], scratch)
-            self.readings.qvel[lane] += added
-        self._forward(lanes)
+        indices = np.flatnonzero(velocity.any(axis=1)).tolist()
+        for index in indices:
+            now, scratch = self.readings.qpos[index], self._scratch
+            added = velocity_after(self._models[index], now, velocity[index], scratch)
+            self.readings.qvel[index] += added
+        self._forward(indices)
 
-    def _forward(self, lanes: Sequence[int]) -> None:
+    def _forward(self, indices: Sequence[int]) -> None:
         self.readings.target_axis[:] = yaw_direction(self.target_quaternion)
-        self._batch.forward(lanes, stage=_UP_TO_VELOCITIES)
+        self._batch.forward(indices, stage=_UP_TO_VELOCITIES)
         self.readings = Readings(*self._views)
 
     def step(self, action: Array) -> NDArray[np.bool_]:
-        """Hold the actions (n, 1) for a control step; whether each lane has diverged so far, (n,).
+        """Hold the actions (n, 1) for a control step; whether each robot has diverged so far, (n,).
 
-        Such a lane and its target were put in their default states, and its episode has ended.
+        Such a robot and its target were put in their default states, and its episode has ended.
         """
         self._control[:] = action
         self._batch.step(nstep=PHYSICS_STEPS, stage=_UP_TO_VELOCITIES)
@@ -290,19 +290,19 @@ class Simulation:
         """The rewards of the current states, (n,)."""
         return self.task.reward(self.readings)
 
-    def model_of(self, lane: int) -> mujoco.MjModel:
-        """The model of a lane's robot as described, with its factors; a new one once it differs."""
-        number = int(self._numbers[lane])
-        key = (number, *self._factors[lane].tolist())
+    def model_of(self, index: int) -> mujoco.MjModel:
+        """The model of a robot as described, with its factors; a new one once it differs."""
+        number = int(self._numbers[index])
+        key = (number, *self._factors[index].tolist())
         if key not in self._shown:
             usual = plain_model(self._drawn(number))
-            self._shown[key] = self._varied(lane, usual, mujoco.MjData(usual))
+            self._shown[key] = self._varied(index, usual, mujoco.MjData(usual))
         return self._shown[key]
 
-    def copy_data(self, lane: int, data: mujoco.MjData | None = None) -> mujoco.MjData:
-        """A lane as a MuJoCo data object of `model_of(lane)`, to render or inspect."""
-        shown = self.model_of(lane)
+    def copy_data(self, index: int, data: mujoco.MjData | None = None) -> mujoco.MjData:
+        """A robot as a MuJoCo data object of `model_of(index)`, to render or inspect."""
+        shown = self.model_of(index)
         data = data or mujoco.MjData(shown)
-        mujoco.mj_setState(shown, data, self._batch.state[lane], _STATE)
+        mujoco.mj_setState(shown, data, self._batch.state[index], _STATE)
         mujoco.mj_forward(shown, data)
         return data

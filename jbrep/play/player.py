@@ -8,7 +8,7 @@ import numpy as np
 
 from jbrep.encoders import FULL
 from jbrep.encoders.base import BaseEncoder
-from jbrep.envs.lanes import Lanes, lanes_at_once
+from jbrep.envs.environments import Environments, envs_at_once
 from jbrep.envs.make import is_batched
 from jbrep.envs.physics import MotionReader
 from jbrep.envs.recording import Actor, Outcome, Recording, joined, record, whole_outcome
@@ -19,7 +19,7 @@ from jbrep.rl.files import EVALUATION_SEED
 
 Begin = Callable[[Task, Sequence[int]], Actor]  # as `Policy.begin`
 
-_BATCH_LANES, _SEPARATE_LANES = 1000, 16  # that `returns` steps at once
+_BATCH_ENVS, _SEPARATE_ENVS = 1000, 16  # that `returns` steps at once
 
 
 class Player(NamedTuple):
@@ -34,7 +34,7 @@ class Player(NamedTuple):
     encoder: BaseEncoder | None = None  # of a trained policy that doesn't observe all features
 
     def play(
-        self, episodes: Sequence[int], begun: Callable[[Lanes], object] = lambda lanes: None
+        self, episodes: Sequence[int], begun: Callable[[Environments], object] = lambda envs: None
     ) -> list[Rollout]:
         """Play some of the episodes that every run is evaluated on.
 
@@ -47,13 +47,13 @@ class Player(NamedTuple):
         seeds = [EVALUATION_SEED + episode for episode in episodes]
         act, read = self.begin(self.task, seeds), MotionReader()
         with (
-            Lanes(self.task, len(seeds)) as lanes,
+            Environments(self.task, len(seeds)) as envs,
             _progress(len(seeds) * self.task.max_episode_steps) as bar,
         ):
-            lanes.reset(range(len(seeds)), seeds)
-            begun(lanes)
-            recording = record(lanes, act, bar.update, read)
-        return [self._rollout(recording, lane, seed, read) for lane, seed in enumerate(seeds)]
+            envs.reset(range(len(seeds)), seeds)
+            begun(envs)
+            recording = record(envs, act, bar.update, read)
+        return [self._rollout(recording, index, seed, read) for index, seed in enumerate(seeds)]
 
     def play_one(self, episode: int) -> Rollout:
         """Play one of these episodes as its evaluation does, without the others.
@@ -70,18 +70,18 @@ class Player(NamedTuple):
 
         return self._replace(begin=begin).play([episode])[0]
 
-    def _rollout(self, recording: Recording, lane: int, seed: int, read: MotionReader) -> Rollout:
-        steps = int(recording.length[lane])
+    def _rollout(self, recording: Recording, index: int, seed: int, read: MotionReader) -> Rollout:
+        steps = int(recording.length[index])
         return Rollout(
             task=self.task,
             name=self.name,
             seed=seed,
-            observation=recording.observation[: steps + 1, lane],
-            action=recording.action[:steps, lane],
-            reward=recording.reward[:steps, lane],
-            terminated=bool(recording.terminated[lane]),
-            truncated=bool(recording.truncated[lane]),
-            motion=read.motion(recording, lane, steps),
+            observation=recording.observation[: steps + 1, index],
+            action=recording.action[:steps, index],
+            reward=recording.reward[:steps, index],
+            terminated=bool(recording.terminated[index]),
+            truncated=bool(recording.truncated[index]),
+            motion=read.motion(recording, index, steps),
             encoder=self.encoder,
         )
 
@@ -97,19 +97,19 @@ class Player(NamedTuple):
         self, count: int, threads: int | None = None, retries: int = 0
     ) -> Iterator[Outcome]:
         """The same with what `info` tells, some episodes at a time, as they are finished."""
-        most = _BATCH_LANES
+        most = _BATCH_ENVS
         if not is_batched(self.task):
-            most = min(threads or _SEPARATE_LANES, _SEPARATE_LANES)
+            most = min(threads or _SEPARATE_ENVS, _SEPARATE_ENVS)
         played = 0
         with _progress(count * self.task.max_episode_steps) as bar:
             while played < count:
                 most = min(most, count - played)
-                with lanes_at_once(self.task, most, threads, retries) as lanes:
-                    size, most = lanes.num_lanes, lanes.num_lanes
+                with envs_at_once(self.task, most, threads, retries) as envs:
+                    size, most = envs.num_envs, envs.num_envs
                     while played + size <= count:
                         first = EVALUATION_SEED + played
                         begin = partial(self.begin, self.task, range(first, first + size))
-                        yield whole_outcome(lanes, begin, first, bar.update)
+                        yield whole_outcome(envs, begin, first, bar.update)
                         played += size
 
     def with_reconstruction(self, encoder: BaseEncoder) -> "Player":

@@ -78,7 +78,7 @@ def _as_stored(episode: Episode) -> Rollout:
 
 
 def _is_same(recording: Recording, rollout: Rollout, own_rewards: bool) -> bool:
-    """Whether the first lane went through the rollout, to the last bit.
+    """Whether the first environment went through the rollout, to the last bit.
 
     Rewards of the user's own are not among it: the environment gives others.
     """

@@ -27,7 +27,7 @@ from torch.distributions import Distribution
 
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.vec_env import JitterbugVecEnv
-from jbrep.envs.lanes import Lanes
+from jbrep.envs.environments import Environments
 from jbrep.envs.recording import Actor, Outcome, held, joined, whole_outcome
 from jbrep.envs.task import Array, Task
 from jbrep.errors import Notice
@@ -57,8 +57,8 @@ def make_env(
     threads: int = 1,
     retries: int = 0,
 ) -> VecEnv:
-    """Lanes of a task seen through an encoder, as hyperparameters say, stepped on threads."""
-    lanes = JitterbugVecEnv(
+    """A task seen through an encoder, as hyperparameters say, stepped on threads."""
+    envs = JitterbugVecEnv(
         task,
         chosen.num_envs,
         seed,
@@ -67,7 +67,7 @@ def make_env(
         action_repeat=chosen.action_repeat,
         retries=retries,
     )
-    return normalized(VecMonitor(lanes)) if chosen.normalize else VecMonitor(lanes)
+    return normalized(VecMonitor(envs)) if chosen.normalize else VecMonitor(envs)
 
 
 def one_line(told: object) -> str:
@@ -88,7 +88,7 @@ def acting(policy: BasePolicy) -> BasePolicy:
 
 
 def training_seed(seed: int) -> int:
-    """The environment's seed in the run with this seed: its first lane's; the others count on."""
+    """The seed of the first environment in the run with this seed; the others count on."""
     return int(np.random.SeedSequence(seed).generate_state(1)[0]) >> 1
 
 
@@ -274,12 +274,14 @@ def restore_statistics(agent: BaseAlgorithm, tensors: Tensors) -> None:
         Statistics.read(tensors).give(env)
 
 
-def evaluate(agent: BaseAlgorithm, lanes: Lanes, encoder: BaseEncoder, episodes: int) -> Outcome:
+def evaluate(
+    agent: BaseAlgorithm, envs: Environments, encoder: BaseEncoder, episodes: int
+) -> Outcome:
     """What comes of an agent's deterministic policy in the same episodes each time.
 
     What it normalises, it normalises by its statistics so far, which stay as they are.
     """
     preprocess = preprocessor(encoder.encode, statistics_of(agent))
-    act, repeat = deterministic_actor(agent.policy, lanes.task, preprocess), action_repeat(agent)
-    seeds = range(EVALUATION_SEED, EVALUATION_SEED + episodes, lanes.num_lanes)
-    return joined((whole_outcome(lanes, lambda: held(act, repeat), s) for s in seeds), episodes)
+    act, repeat = deterministic_actor(agent.policy, envs.task, preprocess), action_repeat(agent)
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + episodes, envs.num_envs)
+    return joined((whole_outcome(envs, lambda: held(act, repeat), s) for s in seeds), episodes)

@@ -21,7 +21,7 @@ from stable_baselines3.common.noise import (
 )
 
 from jbrep.encoders.vec_env import JitterbugVecEnv
-from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs.environments import EnvironmentFailedError
 from jbrep.errors import InputError, differences
 from jbrep.records import container
 from jbrep.records.container import Tensors, without
@@ -40,7 +40,7 @@ from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_STEPS
 
 PARAMETERS = "parameters."  # begins the names of what gradient steps change
-_LANES, _BUFFER = "lanes.", "buffer."  # likewise, of environments and of the replay buffer
+_ENVS, _BUFFER = "envs.", "buffer."  # likewise, of environments and of the replay buffer
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")  # of an agent
 _MEMORIES: dict[type, str] = {  # of noises that depend on what was drawn before
     OrnsteinUhlenbeckActionNoise: "noise_prev",
@@ -222,7 +222,7 @@ def _take(agent: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
     tensors = {f"{PARAMETERS}{name}": t.numpy(force=True) for name, t in parameters(agent)}
     if statistics := statistics_of(agent):
         tensors |= statistics.tensors
-    tensors |= {f"{_LANES}{name}": values for name, values in vec_env(agent).state.items()}
+    tensors |= {f"{_ENVS}{name}": values for name, values in vec_env(agent).state.items()}
     tensors |= {name: getattr(*place) for name, place in _arrays(agent).items()}
     kind, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws there
     tensors |= {"torch": torch.get_rng_state().numpy(), "numpy": np.asarray(keys)}
@@ -258,7 +258,7 @@ def _restore(agent: BaseAlgorithm, tensors: Tensors, counters: Mapping[str, Any]
             values[:] = tensors[f"{_BUFFER}{name}"]
     for name, place in _arrays(agent).items():
         setattr(*place, tensors[name])
-    vec_env(agent).restore(without(_LANES, tensors))
+    vec_env(agent).restore(without(_ENVS, tensors))
     agent.action_space.np_random.bit_generator.state = counters["action_space"]
     torch.set_rng_state(torch.from_numpy(tensors["torch"]))
     if agent.device.type == "cuda":

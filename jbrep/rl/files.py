@@ -71,7 +71,7 @@ class PolicyHeader(Document, frozen=True, kw_only=True):
 class Episode(NamedTuple):
     """An episode of training."""
 
-    step: int  # of training, over all lanes, at its end
+    step: int  # of training, over all environments, at its end
     env: int  # its number
     episode_return: float
     length: int  # control steps

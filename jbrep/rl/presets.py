@@ -77,7 +77,7 @@ class Hyperparameters(Record, frozen=True):
     net_arch: NetArch
     # arguments of the algorithm's class; "linear:0.1" is a schedule from 0.1 to 0
     algorithm_kwargs: Mapping[str, Any]
-    num_envs: Annotated[int, Meta(ge=1, le=MAX_ENVS)] = 1  # lanes stepped together
+    num_envs: Annotated[int, Meta(ge=1, le=MAX_ENVS)] = 1  # environments stepped together
     # on actions scaled to [-1, 1]
     noise: NormalNoise | OrnsteinUhlenbeckNoise | ColouredNoise | None = None
     optimizer_kwargs: Mapping[str, Any] = {}  # arguments of Adam

@@ -12,7 +12,7 @@ from msgspec import UNSET
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.description import as_task
-from jbrep.envs.lanes import lanes_at_once
+from jbrep.envs.environments import envs_at_once
 from jbrep.envs.names import is_code
 from jbrep.envs.task import Task
 from jbrep.records.record import Sha256, to_plain
@@ -113,8 +113,8 @@ def estimate(run: Run) -> float:
     with single_torch_thread(), closing(made) as env, ExitStack() as opened:
         agent = make_agent(settings.algorithm, chosen, env, 0, settings.episode_steps)
         learning = _seconds(lambda: agent.learn(_TRIAL))  # whole rollouts, so at least one
-        lanes = opened.enter_context(lanes_at_once(run.task, episodes, 1, 0))
-        evaluation = _seconds(lambda: evaluate(agent, lanes, encoder, episodes))
+        envs = opened.enter_context(envs_at_once(run.task, episodes, 1, 0))
+        evaluation = _seconds(lambda: evaluate(agent, envs, encoder, episodes))
         taken = settings.control_steps(agent.num_timesteps)
     count = run.steps // settings.evaluate_every + settings.final_episodes / episodes
     return run.steps * learning / taken + count * evaluation

@@ -16,8 +16,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from jbrep.encoders import Encoder, save
 from jbrep.encoders.base import BaseEncoder
+from jbrep.envs.environments import (
+    EnvironmentFailedError,
+    Environments,
+    NonFiniteActionError,
+    envs_at_once,
+)
 from jbrep.envs.infos import by_name
-from jbrep.envs.lanes import EnvironmentFailedError, Lanes, NonFiniteActionError, lanes_at_once
 from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError, StoppedError
 from jbrep.machine import cpu
@@ -214,21 +219,21 @@ class _Progress(BaseCallback):
         self._job, self._history, self._settings = job, history, job.settings
         self._checkpoint = checkpoint
         self._saver = Saver(job.folder, job.settings, versions_of(job.run), job.session.save_every)
-        self._lanes: Lanes | None = None  # of evaluations
+        self._envs: Environments | None = None  # of evaluations
 
     def close(self) -> None:
         """Free what the evaluations hold."""
-        if self._lanes:
-            self._lanes.close()
+        if self._envs:
+            self._envs.close()
 
     def _on_training_start(self) -> None:
         run, session = self._job.run, self._job.session
         episodes = run.evaluation_episodes
         if run.one_robot:
-            self._lanes = vec_env(self.model).lanes
+            self._envs = vec_env(self.model).envs
         else:
             threads = min(session.threads, episodes)
-            self._lanes = lanes_at_once(run.task, episodes, threads, session.retries)
+            self._envs = envs_at_once(run.task, episodes, threads, session.retries)
         if self._checkpoint:
             self._checkpoint.restore(self.model)
             self._checkpoint = None  # a replay buffer can be large
@@ -246,10 +251,10 @@ class _Progress(BaseCallback):
 
     def _on_step(self) -> bool:
         ended = np.flatnonzero(self.locals["dones"]).tolist()
-        for lane in ended:
-            info = self.locals["infos"][lane]
+        for index in ended:
+            info = self.locals["infos"][index]
             total, length = float(info["episode"]["r"]), info["control_steps"]
-            row = Episode(self._step, lane, total, length, info.get("non_finite", False))
+            row = Episode(self._step, index, total, length, info.get("non_finite", False))
             self._history.episodes.append(row)
         if self._is_evaluation_due(bool(ended)):
             self._evaluate(self.locals["new_obs"])
@@ -280,8 +285,8 @@ class _Progress(BaseCallback):
             observed[:] = first
 
     def _play(self, episodes: int) -> None:
-        assert self._lanes is not None
-        outcome = evaluate(self.model, self._lanes, self._job.encoder, episodes)
+        assert self._envs is not None
+        outcome = evaluate(self.model, self._envs, self._job.encoder, episodes)
         logger = self.model.logger
         self._history.add(self._step, outcome)
         logger.record("evaluation/mean_return", self._history.means[-1])

@@ -1,4 +1,4 @@
-"""Lanes: many environments of one task, each reset with a seed of its own and stepped together."""
+"""Many environments of one task, each reset with a seed of its own and stepped together."""
 
 import math
 import warnings
@@ -58,30 +58,30 @@ class Retries:
         self._left = self._most
 
 
-def check_counts(num_lanes: int, num_threads: int | None) -> None:
-    """Check the numbers of lanes and threads."""
-    for count, what in ((num_lanes, "lanes"), (num_threads, "threads")):
+def check_counts(num_envs: int, num_threads: int | None) -> None:
+    """Check the numbers of environments and threads."""
+    for count, what in ((num_envs, "environments"), (num_threads, "threads")):
         if count is not None and count < 1:
             raise InputError(f"the number of {what} is {count}: it must be at least 1")
 
 
-def lanes_at_once(task: Task, most: int, threads: int | None, retries: int) -> "Lanes":
-    """At most so many lanes as there may be: one of a robot that exists once."""
+def envs_at_once(task: Task, most: int, threads: int | None, retries: int) -> "Environments":
+    """At most so many environments as there may be: one of a robot that exists once."""
     try:
-        return Lanes(task, most, threads, Retries(retries))
+        return Environments(task, most, threads, Retries(retries))
     except InputError:
         if most == 1 or is_batched(task):
             raise
-    return Lanes(task, 1, threads, Retries(retries))
+    return Environments(task, 1, threads, Retries(retries))
 
 
-def check_actions(actions: ArrayLike, num_lanes: int, size: int) -> NDArray[np.float64]:
-    """The actions as (num_lanes, size) float64, all finite."""
+def check_actions(actions: ArrayLike, num_envs: int, size: int) -> NDArray[np.float64]:
+    """The actions as (num_envs, size) float64, all finite."""
     checked: NDArray[np.float64] = np.asarray(actions, dtype=np.float64)
-    if checked.shape != (num_lanes, size):
+    if checked.shape != (num_envs, size):
         raise InputError(
-            f"actions have shape {checked.shape}: it must be ({num_lanes}, {size}), one action for "
-            "each lane"
+            f"actions have shape {checked.shape}: it must be ({num_envs}, {size}), one action for "
+            "each environment"
         )
     if not math.isfinite(checked.sum()) and not np.isfinite(checked).all():
         raise NonFiniteActionError(f"actions are not finite: {checked.ravel()}")
@@ -89,73 +89,73 @@ def check_actions(actions: ArrayLike, num_lanes: int, size: int) -> NDArray[np.f
 
 
 class Step(NamedTuple):
-    """What a step of n lanes led to; treat the arrays as read-only."""
+    """What a step of n environments led to; treat the arrays as read-only."""
 
     observation: Array  # (n, d) of the new states; the last one of its episode where that ended
-    reward: Array  # (n,) 0 in a lane whose episode had ended before
+    reward: Array  # (n,) 0 in an environment whose episode had ended before
     terminated: Flags  # (n,) true from the step on that ended the episode
     truncated: Flags  # (n,) likewise; also where the physics diverged
     arrays: Mapping[str, Array]  # those of the task's `state` and `constants`, (n, width) each
 
 
-class Lanes:
-    """n lanes of a task, each going through an episode at a time.
+class Environments:
+    """Environments of a task, n of them, each going through an episode at a time.
 
-    A lane whose episode has ended stands still until it is reset. What a lane does depends on its
-    own seed and actions alone, not on the number of lanes or threads.
+    An environment whose episode has ended stands still until it is reset. What one does depends on
+    its own seed and actions alone, not on the number of environments or threads.
 
     Args:
         task: whose environment is made.
-        num_lanes: n.
+        num_envs: n.
         num_threads: threads to step a batch on; None takes one for each core.
         retries: of failures of separate environments, each of which ends an episode before the step
             that failed; by default none.
 
     Attributes:
-        observation: the current one of each lane, (n, d) in physical units.
+        observation: the current one of each environment, (n, d) in physical units.
         arrays: the current ones of the task's `state` and `constants`, (n, width) each.
-        info: all that a batch tells of its lanes, by name, (n, ...) each.
-        terminated, truncated: how each lane's episode has ended, (n,).
-        active: whether it goes on, (n,); num_active: in how many lanes it does.
+        info: all that a batch tells of its environments, by name, (n, ...) each.
+        terminated, truncated: how each environment's episode has ended, (n,).
+        active: whether it goes on, (n,); num_active: in how many environments it does.
         lost: whether the last step led to nothing that can be used, (n,): it doesn't count, and its
             episode ended before it, truncated.
-        missing: readings that were missing in each lane's episode, (n,).
-        envs: the environments themselves: a batch, or one for each lane.
+        missing: readings that were missing in each environment's episode, (n,).
+        instances: a batch, or one instance for each environment.
     """
 
     def __init__(
         self,
         task: Task,
-        num_lanes: int,
+        num_envs: int,
         num_threads: int | None = None,
         retries: Retries | None = None,
     ):
-        check_counts(num_lanes, num_threads)
-        self.task, self.num_lanes = task, num_lanes
+        check_counts(num_envs, num_threads)
+        self.task, self.num_envs = task, num_envs
         if is_batched(task):
             if task.offset.any():
                 raise InputError(f"{task.name} is stepped as a batch: its features have no offsets")
-            self._batch: Any = make_batch(task, num_lanes, num_threads)
-            self.envs: Any = self._batch
+            self._batch: Any = make_batch(task, num_envs, num_threads)
+            self.instances: Any = self._batch
         else:
-            self._batch = Separate(task.whole, num_lanes, retries or Retries())
-            self.envs = self._batch.envs
+            self._batch = Separate(task.whole, num_envs, retries or Retries())
+            self.instances = self._batch.instances
         if task.domain:
-            self._batch = Disturbed(self._batch, task, num_lanes)
+            self._batch = Disturbed(self._batch, task, num_envs)
         if task.view:
-            self._batch = Seen(self._batch, task, num_lanes)
-        self.lost = np.zeros(num_lanes, np.bool_)
+            self._batch = Seen(self._batch, task, num_envs)
+        self.lost = np.zeros(num_envs, np.bool_)
         self.missing: NDArray[np.int64] = getattr(
-            self._batch, "missing", np.zeros(num_lanes, np.int64)
+            self._batch, "missing", np.zeros(num_envs, np.int64)
         )
-        self.observation = np.zeros((num_lanes, task.size))
+        self.observation = np.zeros((num_envs, task.size))
         self.arrays: Mapping[str, Array] = {}
         self.info: Mapping[str, Any] = {}
         self._names = tuple(task.arrays)
-        self.terminated = self.truncated = np.ones(num_lanes, dtype=np.bool_)
+        self.terminated = self.truncated = np.ones(num_envs, dtype=np.bool_)
         self._count()
-        self._seeds = np.zeros(num_lanes, np.int64)
-        self._steps = np.zeros(num_lanes, np.int64)
+        self._seeds = np.zeros(num_envs, np.int64)
+        self._steps = np.zeros(num_envs, np.int64)
 
     @property
     def has_failed(self) -> bool:
@@ -164,41 +164,41 @@ class Lanes:
 
     @property
     def numbers(self) -> list[Numbers]:
-        """What each lane's last step told in `info`, see `Separate`; batches tell nothing."""
-        return getattr(self._batch, "numbers", None) or [{} for _ in range(self.num_lanes)]
+        """What the last step of each told in `info`, see `Separate`; batches tell nothing."""
+        return getattr(self._batch, "numbers", None) or [{} for _ in range(self.num_envs)]
 
     @property
     def steps(self) -> NDArray[np.int64]:
-        """That each lane's episode has had so far, (n,)."""
+        """That each environment's episode has had so far, (n,)."""
         return self._steps.copy()
 
-    def reset(self, lanes: Sequence[int], seeds: Sequence[int]) -> Array:
-        """Start an episode in each of the lanes, with its seed.
+    def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> Array:
+        """Start an episode in each of the environments, with its seed.
 
         Returns:
-            The current observations of all lanes, (n, d).
+            The current observations of all environments, (n, d).
         """
-        at = np.asarray(lanes)
+        at = np.asarray(indices)
         self._seeds[at], self._steps[at] = seeds, 0
         self.terminated, self.truncated = self.terminated.copy(), self.truncated.copy()
         self.terminated[at] = self.truncated[at] = False
         self._count()
-        given = dict(zip(lanes, map(int, seeds), strict=True))
-        every = [given.get(lane) for lane in range(self.num_lanes)]
-        mask = np.isin(np.arange(self.num_lanes), lanes)
+        given = dict(zip(indices, map(int, seeds), strict=True))
+        every = [given.get(index) for index in range(self.num_envs)]
+        mask = np.isin(np.arange(self.num_envs), indices)
         observation, info = self._batch.reset(seed=every, options={"reset_mask": mask})
-        self._check(observation, np.zeros(self.num_lanes), "reset gave")
+        self._check(observation, np.zeros(self.num_envs), "reset gave")
         self._see(observation, info)
         return observation
 
     def step(self, actions: ArrayLike) -> Step:
-        """Take one step in every lane whose episode goes on; actions (n, k)."""
-        checked = check_actions(actions, self.num_lanes, self.task.action_size)
+        """Take one step in every environment whose episode goes on; actions (n, k)."""
+        checked = check_actions(actions, self.num_envs, self.task.action_size)
         active = self.active
         self._steps += active
         observation, reward, terminated, truncated, info = self._batch.step(checked)
         arrays = {name: info[name] for name in self._names}
-        if self.num_active < self.num_lanes:
+        if self.num_active < self.num_envs:
             here = active[:, None]
             observation = np.where(here, observation, self.observation)
             arrays = {n: np.where(here, values, self.arrays[n]) for n, values in arrays.items()}
@@ -219,19 +219,19 @@ class Lanes:
         return self._batch.metadata
 
     def render(self) -> Sequence[Any]:
-        """What the environment of each lane draws, as its `render_mode` says."""
+        """What each environment draws, as its `render_mode` says."""
         return self._batch.render()
 
     def abandon(self) -> None:
         """Leave all episodes as if they had ended."""
-        self.terminated = np.ones(self.num_lanes, dtype=np.bool_)
+        self.terminated = np.ones(self.num_envs, dtype=np.bool_)
         self._count()
 
     def close(self) -> None:
         """Free what the environments hold; a separate one is kept for the next who needs it."""
         self._batch.close()
 
-    def __enter__(self) -> "Lanes":
+    def __enter__(self) -> "Environments":
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -252,10 +252,10 @@ class Lanes:
         good = np.isfinite(observation).all(axis=1) & np.isfinite(reward)
         if good.all():
             return  # their sum overflows
-        lane = int(np.flatnonzero(~good)[0])
+        index = int(np.flatnonzero(~good)[0])
         raise EnvironmentFailedError(
             f"{self.task.name} {did} an observation or reward that is not finite, at step "
-            f"{self._steps[lane]} of the episode with seed {self._seeds[lane]}"
+            f"{self._steps[index]} of the episode with seed {self._seeds[index]}"
         )
 
 
@@ -264,39 +264,39 @@ class _MissingError(Exception):
 
 
 class Separate:
-    """An environment for each lane, used like a batch: simulations of any kind, and real robots.
+    """Separate instances, used like a batch: simulations of any kind, and real robots.
 
     Attributes:
-        envs: the environments; None where one failed, until the lane is reset.
-        lost, missing: as of `Lanes`; the observation after a lost step is still the one before it.
-        failed: whether the environment failed in each lane's episode, (n,).
+        instances: the environments; None where one failed, until it is reset.
+        lost, missing: as of `Environments`; after a lost step the observation is the one before it.
+        failed: whether the environment failed in each environment's episode, (n,).
     """
 
-    def __init__(self, task: Task, num_lanes: int, retries: Retries):
-        self._task, self._retries = task, [copy(retries) for _ in range(num_lanes)]
-        self.envs: list[Any] = []
+    def __init__(self, task: Task, num_envs: int, retries: Retries):
+        self._task, self._retries = task, [copy(retries) for _ in range(num_envs)]
+        self.instances: list[Any] = []
         try:
-            for _ in range(num_lanes):
-                self.envs.append(self._take())
+            for _ in range(num_envs):
+                self.instances.append(self._take())
         except BaseException:
             self.close()
             raise
-        self.metadata: Mapping[str, Any] = self.envs[0].metadata
-        self._flat = flattener(self.envs[0].observation_space)
-        self._action_space = self.envs[0].action_space
+        self.metadata: Mapping[str, Any] = self.instances[0].metadata
+        self._flat = flattener(self.instances[0].observation_space)
+        self._action_space = self.instances[0].action_space
         self._offset = task.offset if task.offset.any() else None
-        self._observation = np.zeros((num_lanes, task.size))
-        self._reward = np.zeros(num_lanes)
-        self._arrays = {name: np.zeros((num_lanes, w)) for name, w in task.arrays.items()}
-        self._infos: list[Mapping[str, Any]] = [{} for _ in range(num_lanes)]
-        self._succeeded = np.zeros(num_lanes, np.bool_)  # at any step of the episode so far
-        self._active = np.zeros(num_lanes, np.bool_)
-        self._seeds: list[int | None] = [0] * num_lanes
-        self._steps = np.zeros(num_lanes, np.int64)  # of each episode, with the one under way
-        self._last_reward = np.zeros(num_lanes)  # of the episode under way
-        self._held = np.zeros(num_lanes, np.int64)  # steps in a row with missing readings
-        self.missing = np.zeros(num_lanes, np.int64)
-        self.lost, self.failed = np.zeros((2, num_lanes), np.bool_)
+        self._observation = np.zeros((num_envs, task.size))
+        self._reward = np.zeros(num_envs)
+        self._arrays = {name: np.zeros((num_envs, w)) for name, w in task.arrays.items()}
+        self._infos: list[Mapping[str, Any]] = [{} for _ in range(num_envs)]
+        self._succeeded = np.zeros(num_envs, np.bool_)  # at any step of the episode so far
+        self._active = np.zeros(num_envs, np.bool_)
+        self._seeds: list[int | None] = [0] * num_envs
+        self._steps = np.zeros(num_envs, np.int64)  # of each episode, with the one under way
+        self._last_reward = np.zeros(num_envs)  # of the episode under way
+        self._held = np.zeros(num_envs, np.int64)  # steps in a row with missing readings
+        self.missing = np.zeros(num_envs, np.int64)
+        self.lost, self.failed = np.zeros((2, num_envs), np.bool_)
 
     def _take(self) -> Any:
         task = self._task
@@ -307,24 +307,24 @@ class Separate:
         self, seed: Sequence[int | None], options: Mapping[str, Flags]
     ) -> tuple[Array, dict[str, Array]]:
         self._make_new_arrays()
-        for lane in np.flatnonzero(options["reset_mask"]).tolist():
-            self._begin(lane, seed[lane])
+        for index in np.flatnonzero(options["reset_mask"]).tolist():
+            self._begin(index, seed[index])
         return self._observation, self._arrays
 
-    def _begin(self, lane: int, seed: int | None) -> None:
-        self._seeds[lane], self._steps[lane], self._active[lane] = seed, 0, True
+    def _begin(self, index: int, seed: int | None) -> None:
+        self._seeds[index], self._steps[index], self._active[index] = seed, 0, True
         while True:
-            self._held[lane] = self.missing[lane] = self._last_reward[lane] = 0
-            self.failed[lane] = False
+            self._held[index] = self.missing[index] = self._last_reward[index] = 0
+            self.failed[index] = False
             try:
-                self.envs[lane] = self.envs[lane] or self._take()
+                self.instances[index] = self.instances[index] or self._take()
                 with aside(), in_time():
-                    observation, info = self.envs[lane].reset(seed=seed)
-                return self._put(lane, observation, info)
+                    observation, info = self.instances[index].reset(seed=seed)
+                return self._put(index, observation, info)
             except OURS:
                 raise
             except BaseException as error:
-                self._handle_failure(lane, error)
+                self._handle_failure(index, error)
 
     def step(self, actions: Array) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
         chosen = self._active.copy()
@@ -333,31 +333,31 @@ class Separate:
         single = actions.astype(np.float32)
         terminated, truncated = np.zeros((2, len(chosen)), np.bool_)
         with aside(in_episode=True), in_time():
-            for lane in np.flatnonzero(chosen).tolist():
-                self._steps[lane] += 1
+            for index in np.flatnonzero(chosen).tolist():
+                self._steps[index] += 1
                 try:
-                    terminated[lane], truncated[lane] = self._step(lane, single[lane])
+                    terminated[index], truncated[index] = self._step(index, single[index])
                 except _MissingError:
-                    self._lose(lane)
+                    self._lose(index)
                 except OURS:
                     raise
                 except BaseException as error:
-                    self._handle_failure(lane, error)
-                    self._lose(lane)
-                    self.failed[lane] = True
-                truncated[lane] |= self.lost[lane]
-                self._active[lane] = not (terminated[lane] or truncated[lane])
-                if not (self._active[lane] or self.lost[lane]):
-                    self._retries[lane].succeeded()
+                    self._handle_failure(index, error)
+                    self._lose(index)
+                    self.failed[index] = True
+                truncated[index] |= self.lost[index]
+                self._active[index] = not (terminated[index] or truncated[index])
+                if not (self._active[index] or self.lost[index]):
+                    self._retries[index].succeeded()
         return self._observation, self._reward, terminated, truncated, self._arrays
 
-    def _step(self, lane: int, action: NDArray[np.float32]) -> tuple[bool, bool]:
+    def _step(self, index: int, action: NDArray[np.float32]) -> tuple[bool, bool]:
         own = action_in(self._action_space, action)  # which the environment may change
-        observation, reward, terminated, truncated, info = self.envs[lane].step(own)
+        observation, reward, terminated, truncated, info = self.instances[index].step(own)
         ends = number(terminated, "terminated"), number(truncated, "truncated")
         if math.isnan(sum(ends)):
             raise ValueError("it gave a terminated or truncated that is not a number")
-        self._put(lane, observation, info, number(reward, "reward"), True)
+        self._put(index, observation, info, number(reward, "reward"), True)
         return bool(ends[0]), bool(ends[1])
 
     def _make_new_arrays(self) -> None:
@@ -368,7 +368,7 @@ class Separate:
 
     def _put(
         self,
-        lane: int,
+        index: int,
         observation: Any,
         info: Mapping[str, Any],
         reward: float = 0.0,
@@ -378,64 +378,64 @@ class Separate:
         if self._offset is not None:
             flat = flat - self._offset
         if float(np.abs(flat).sum()) + abs(reward) <= _LARGEST:
-            self._held[lane] = 0
+            self._held[index] = 0
         else:
-            flat, reward = self._without_missing(lane, flat, reward, after_step)
-        self._observation[lane] = flat
-        self._reward[lane] = self._last_reward[lane] = reward
+            flat, reward = self._without_missing(index, flat, reward, after_step)
+        self._observation[index] = flat
+        self._reward[index] = self._last_reward[index] = reward
         for name, values in self._arrays.items():
-            values[lane] = info[name]
+            values[index] = info[name]
         info = info or {}
-        self._infos[lane] = info
-        self._succeeded[lane] &= after_step
-        self._succeeded[lane] |= after_step and bool(number_of(info.get(SUCCESS)))
+        self._infos[index] = info
+        self._succeeded[index] &= after_step
+        self._succeeded[index] |= after_step and bool(number_of(info.get(SUCCESS)))
 
     def _without_missing(
-        self, lane: int, flat: Array, reward: float, after_step: bool
+        self, index: int, flat: Array, reward: float, after_step: bool
     ) -> tuple[Array, float]:
         """An observation and a reward in which the last ones stand for those that are missing."""
         missing, is_missing = ~(np.abs(flat) <= _LARGEST), not abs(reward) <= _LARGEST
         if not missing.any() and not is_missing:
             return flat, reward  # their sum is larger
-        self.missing[lane] += missing.sum() + is_missing
-        self._held[lane] += 1
-        if self._task.missing == "skip" and self._steps[lane] > 1:
+        self.missing[index] += missing.sum() + is_missing
+        self._held[index] += 1
+        if self._task.missing == "skip" and self._steps[index] > 1:
             raise _MissingError
-        if not after_step or self._held[lane] > most_held(self._task.missing or ""):
+        if not after_step or self._held[index] > most_held(self._task.missing or ""):
             raise EnvironmentFailedError(
                 f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
-                f"reward that is not finite in 32 bits, {self._where(lane)}: `missing` says what "
+                f"reward that is not finite in 32 bits, {self._where(index)}: `missing` says what "
                 "to do, such as hold:3, or skip if it isn't in an episode's first step"
             )
-        filled = np.where(missing, self._observation[lane], flat)
-        return filled, self._last_reward[lane] if is_missing else reward
+        filled = np.where(missing, self._observation[index], flat)
+        return filled, self._last_reward[index] if is_missing else reward
 
-    def _where(self, lane: int) -> str:
-        return f"at step {self._steps[lane]} of the episode with seed {self._seeds[lane]}"
+    def _where(self, index: int) -> str:
+        return f"at step {self._steps[index]} of the episode with seed {self._seeds[index]}"
 
-    def _lose(self, lane: int) -> None:
-        """Let the episode of a lane end before the step that it just took."""
-        self.lost[lane], self._reward[lane] = True, 0.0
-        self._steps[lane] -= 1
+    def _lose(self, index: int) -> None:
+        """Let the episode of an environment end before the step that it just took."""
+        self.lost[index], self._reward[index] = True, 0.0
+        self._steps[index] -= 1
 
-    def _handle_failure(self, lane: int, error: BaseException) -> None:
+    def _handle_failure(self, index: int, error: BaseException) -> None:
         """Go on after a failure, unless there were too many, with a new instance."""
-        if self.envs[lane] is not None:
-            discard(self.envs[lane])
-            self.envs[lane] = None
+        if self.instances[index] is not None:
+            discard(self.instances[index])
+            self.instances[index] = None
         if not isinstance(error, EnvironmentFailedError):
             error = EnvironmentFailedError(
-                f"{self._task.name} failed {self._where(lane)}: {kind_and_line(error)}"
+                f"{self._task.name} failed {self._where(index)}: {kind_and_line(error)}"
             )
-        self._retries[lane].failed(error)
+        self._retries[index].failed(error)
 
     def render(self) -> tuple[Any, ...]:
         with aside():
-            return tuple(env.render() for env in self.envs)
+            return tuple(env.render() for env in self.instances)
 
     @property
     def numbers(self) -> list[Numbers]:
-        """What each lane's last step told in `info`; `is_success` if any step of its episode did.
+        """What each one's last step told in `info`; `is_success` if any step of its episode did.
 
         An environment may go on after a success, so its last step alone would miss some.
         """
@@ -444,6 +444,6 @@ class Separate:
 
     def close(self) -> None:
         """Give the environments back."""
-        for env in self.envs:
+        for env in self.instances:
             if env is not None:
                 give_back(env)

@@ -1,11 +1,11 @@
-"""Lanes over any environment: resets, ends, snapshots, and environments that fail."""
+"""Environments over any environment: resets, ends, snapshots, and environments that fail."""
 
 import gymnasium
 import numpy as np
 import pytest
 
-from jbrep.envs import Lanes, describe
-from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
+from jbrep.envs import Environments, describe
+from jbrep.envs.environments import EnvironmentFailedError, NonFiniteActionError
 from jbrep.envs.recording import open_loop, play, read_states, record
 from jbrep.errors import InputError
 
@@ -20,7 +20,7 @@ each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 
 
 def actions_of(task, seeds, steps):
-    """Actions (T, n, k), each lane's from its own seed."""
+    """Actions (T, n, k), each environment's from its own seed."""
     shape = (steps, task.action_size)
     drawn = [
         np.random.default_rng([seed, 1]).uniform(task.action_low, task.action_high, shape)
@@ -29,11 +29,11 @@ def actions_of(task, seeds, steps):
     return np.stack(drawn, axis=1).astype(np.float32)
 
 
-def played(task, seeds, lanes=None, steps=40):
-    """What so many lanes go through with these seeds."""
-    lanes = lanes or Lanes(task, len(seeds), 1)
-    lanes.reset(range(len(seeds)), seeds)
-    return record(lanes, open_loop(actions_of(task, seeds, steps)), lambda made: None, read_states)
+def played(task, seeds, envs=None, steps=40):
+    """What so many environments go through with these seeds."""
+    envs = envs or Environments(task, len(seeds), 1)
+    envs.reset(range(len(seeds)), seeds)
+    return record(envs, open_loop(actions_of(task, seeds, steps)), lambda made: None, read_states)
 
 
 def assert_same_episode(one, i, other, j):
@@ -54,18 +54,18 @@ def assert_same_episode(one, i, other, j):
 
 
 @each_task
-def test_a_lane_s_episode_depends_on_its_seed_and_actions_alone(task):
-    """Neither on the lanes beside it, nor on the episodes before it."""
+def test_a_environment_s_episode_depends_on_its_seed_and_actions_alone(task):
+    """Neither on the environments beside it, nor on the episodes before it."""
     many = played(task, [5, 6, 7, 8])
-    for lane, seed in enumerate([5, 6, 7, 8]):
-        assert_same_episode(many, lane, played(task, [seed]), 0)
-    used = Lanes(task, 2, 1)
+    for index, seed in enumerate([5, 6, 7, 8]):
+        assert_same_episode(many, index, played(task, [seed]), 0)
+    used = Environments(task, 2, 1)
     played(task, [1, 2], used)
     assert_same_episode(many, 2, played(task, [9, 7], used), 1)
 
 
 @each_task
-def test_a_lane_is_the_environment_that_gymnasium_makes(task):
+def test_a_environment_is_the_environment_that_gymnasium_makes(task):
     recording = played(task, [3])
     environment = gymnasium.make(task.id, max_episode_steps=30)
     observation, _ = environment.reset(seed=3)
@@ -78,24 +78,24 @@ def test_a_lane_is_the_environment_that_gymnasium_makes(task):
 
 
 @each_task
-def test_chosen_lanes_are_reset_and_the_others_go_on(task):
-    lanes, undisturbed = Lanes(task, 3, 1), Lanes(task, 3, 1)
-    for each in (lanes, undisturbed):
+def test_chosen_environments_are_reset_and_the_others_go_on(task):
+    envs, undisturbed = Environments(task, 3, 1), Environments(task, 3, 1)
+    for each in (envs, undisturbed):
         each.reset([0, 1, 2], [4, 5, 6])
     actions = actions_of(task, [4, 5, 6], 8)
     for step, action in enumerate(actions):
         if step == 4:
-            observation = lanes.reset([1], [9])
+            observation = envs.reset([1], [9])
             np.testing.assert_array_equal(observation[[0, 2]], undisturbed.observation[[0, 2]])
             assert (observation[1] != undisturbed.observation[1]).any()
-        new, old = lanes.step(action), undisturbed.step(action)
+        new, old = envs.step(action), undisturbed.step(action)
         for one, other in zip(new[:4], old[:4], strict=True):
             np.testing.assert_array_equal(one[[0, 2]], other[[0, 2]])
-    alone = Lanes(task, 1, 1)
+    alone = Environments(task, 1, 1)
     alone.reset([0], [9])
     for action in actions[4:]:
         alone.step(action[1:2])
-    np.testing.assert_array_equal(alone.observation[0], lanes.observation[1])
+    np.testing.assert_array_equal(alone.observation[0], envs.observation[1])
 
 
 def test_terminated_and_truncated_are_told_apart():
@@ -111,55 +111,55 @@ def test_terminated_and_truncated_are_told_apart():
     assert (both.length[0], both.terminated[0], both.truncated[0]) == (7, True, True)
 
 
-def test_a_lane_that_has_ended_stands_still():
-    lanes = Lanes(SLEDGE, 4)
+def test_a_environment_that_has_ended_stands_still():
+    envs = Environments(SLEDGE, 4)
     seeds = [0, 1, 2, 3]
-    lanes.reset(range(4), seeds)
-    last, ended_at = lanes.observation.copy(), {}
-    for step, each in enumerate(play(lanes, open_loop(actions_of(SLEDGE, seeds, 40)))):
+    envs.reset(range(4), seeds)
+    last, ended_at = envs.observation.copy(), {}
+    for step, each in enumerate(play(envs, open_loop(actions_of(SLEDGE, seeds, 40)))):
         before = ~each.active
         np.testing.assert_array_equal(each.step.observation[before], last[before])
         assert not each.step.reward[before].any()
         np.testing.assert_array_equal(each.step.terminated[before], True)
-        assert lanes.num_active == lanes.active.sum()
-        for lane in np.flatnonzero(~lanes.active):
-            ended_at.setdefault(lane, step)
+        assert envs.num_active == envs.active.sum()
+        for index in np.flatnonzero(~envs.active):
+            ended_at.setdefault(index, step)
         last = each.step.observation.copy()
     assert len(set(ended_at.values())) > 1
-    np.testing.assert_array_equal(lanes.reset([0], [0])[1:], last[1:])
-    assert lanes.active.tolist() == [True, False, False, False]
+    np.testing.assert_array_equal(envs.reset([0], [0])[1:], last[1:])
+    assert envs.active.tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize("how", ["raises", "size", "nan", "huge", "reward"])
 def test_an_environment_that_fails_is_named_with_its_seed_and_step(how):
     task = describe("Sledges/Broken-v0", {"how": how, "seed": 12})
-    lanes = Lanes(task, 3)
-    lanes.reset(range(3), [11, 12, 13])
+    envs = Environments(task, 3)
+    envs.reset(range(3), [11, 12, 13])
     actions = actions_of(task, [11, 12, 13], 4)
     for action in actions[:3]:
-        lanes.step(action)
+        envs.step(action)
     with pytest.raises(EnvironmentFailedError, match=BROKEN.get(how, NOT_FINITE)) as failure:
-        lanes.step(actions[3])
+        envs.step(actions[3])
     assert "at step 4 of the episode with seed 12" in str(failure.value)
 
 
 def test_actions_have_as_many_numbers_as_the_task_s():
-    lanes = Lanes(SLEDGE, 2)
-    lanes.reset([0, 1], [0, 1])
+    envs = Environments(SLEDGE, 2)
+    envs.reset([0, 1], [0, 1])
     with pytest.raises(InputError, match=r"\(2, 3\)"):
-        lanes.step(np.zeros((3, 3)))
+        envs.step(np.zeros((3, 3)))
     with pytest.raises(NonFiniteActionError):
-        lanes.step(np.full((2, 3), np.nan))
-    with pytest.raises(InputError, match="the number of lanes is 0"):
-        Lanes(SLEDGE, 0)
+        envs.step(np.full((2, 3), np.nan))
+    with pytest.raises(InputError, match="the number of environments is 0"):
+        Environments(SLEDGE, 0)
 
 
 def test_actions_are_stepped_as_they_are_stored():
     """In 32 bits, within bounds that have 64."""
     task = describe("Sledges/Exact-v0")
-    lanes = Lanes(task, 2)
-    lanes.reset([0, 1], [0, 1])
+    envs = Environments(task, 2)
+    envs.reset([0, 1], [0, 1])
     for action in ([task.action_low, task.action_high], [[0.2], [0.29]]):
-        observation = lanes.step(np.array(action)).observation
+        observation = envs.step(np.array(action)).observation
         np.testing.assert_array_equal(observation[:, 0], np.float32(action)[:, 0])
         np.testing.assert_array_equal(observation[:, 1], 0)
