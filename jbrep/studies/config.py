@@ -18,7 +18,7 @@ from jbrep.envs.description import describe, read_bounds
 from jbrep.envs.domain import Domain, read_ranges
 from jbrep.envs.names import find_spec, taken_for
 from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES, EpisodeSteps, Id, Missing, Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, choose
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.records.document import Document, read_toml, toml_text
 from jbrep.records.record import Record, converted, from_plain, pattern, to_plain
@@ -412,13 +412,17 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         return lines
 
 
+_KEYS = dict.fromkeys(  # of a study's file
+    sorted({*Study.__struct_fields__, "env", *_OF_EACH} - {"environment", "learners", "described"})
+)
+
+
 def read_study(path: Path) -> Study:
     """A study from its TOML file."""
     given = read_toml(path)
     try:
-        for name, where in (("learners", "algorithms.NAME"), ("described", "the list of tasks")):
-            if name in given:  # which files of jbrep have beside names
-                raise InputError(f"unknown {name!r}: such settings are in {where}")
+        for key in given:
+            choose(key, _KEYS, "key")
         study = as_study(given)
         for task in study.tasks:
             own = study.described.get(task)
