@@ -43,7 +43,7 @@ def test_episodes_say_which_policy_acted_in_them(mixture):
 
 
 def test_neither_environments_nor_threads_change_a_byte(mixture, tmp_path):
-    collect(mixed(), tmp_path / "data", envs=3, num_threads=2)
+    collect(mixed(), tmp_path / "data", num_envs=3, num_threads=2)
     assert contents(tmp_path / "data") == contents(mixture)
 
 

@@ -114,7 +114,7 @@ def test_a_study_from_toml(tmp_path):
 @pytest.mark.parametrize(
     ("line", "field"),
     [
-        ("task = 7", "unknown task"),
+        ("task = 7", "unknown key 'task'"),
         ('tasks = ["fly"]', "unknown task 'fly'"),
         ('tasks = ["Robots/Ant-v0", "Robots-Ant-v0"]', "share a folder"),
         ('algorithms = ["a2c-best"]', "unknown preset .*'best'"),
