@@ -11,7 +11,9 @@ from msgspec.structs import asdict
 from jbrep.checking.features import TURNS, Finding, Shapes
 from jbrep.checking.seen import Seen
 from jbrep.coordinates import make_coordinates
-from jbrep.envs.names import modules_of
+from jbrep.envs.description import describe
+from jbrep.envs.names import modules_of, spec_of
+from jbrep.envs.probe import Bounds
 from jbrep.envs.task import Feature, Task
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError
@@ -42,8 +44,14 @@ def advise(
     Their file stands `where`, `data` is the folder that was read.
     """
     task, features = seen.task, _found(seen, shapes)
-    kinds = [[(each.kind, each.frame) for each in some] for some in (features, task.whole.features)]
-    use_file = bool(where or kinds[0] != kinds[1] or any(e.kind == "scales" for e in findings))
+    bounds = tuple(zip(task.action_low, task.action_high, strict=True))
+    own = task.whole if data else _own(task, bounds)
+    kinds = [
+        [(each.name, each.kind, each.frame) for each in some]
+        for some in (features, task.whole.features, own.features)
+    ]
+    scales = any(each.kind == "scales" for each in findings)
+    use_file = bool(where or kinds[0] != kinds[1] or kinds[1] != kinds[2] or scales)
     known = task.whole.replace(features=features) if use_file else task.whole
     hidden = [*(task.view.hidden if task.view else ())]
     for each in findings:
@@ -53,14 +61,13 @@ def advise(
     history = max([*steps, task.view.history if task.view else 1])
     system, why = ("symmetry", "turning and shifting it was tried: nothing else changes")
     if not is_symmetric:
-        system, why = _system(with_view(known, hidden, history))
+        winds = any(each.kind == "winds" for each in findings)
+        system, why = _system(with_view(known, hidden, history), winds)
     view = [f"--hide={name}" for name in hidden] + [f"--history={history}"] * (history > 1)
     if data is None:
         file = [f"--features={where or 'features.toml'}"] * use_file
-        named = ["--task", task.name.removesuffix(task.view.suffix if task.view else "")]
-        named += [f"--import={each}" for each in modules_of(task)]
-        named += [f"--env={each}" for each in task.given_arguments]
-        lines = [["rl", *named, *file, *view, "--encoder", system, "--out", "runs/first"]]
+        given = [*_given(task), *file, *view]
+        lines = [["rl", *given, "--encoder", system, "--out", "runs/first"]]
     else:
         kind = "identity" if system == "full" else system
         again = f"{data}-seen" if view else str(data)
@@ -70,11 +77,36 @@ def advise(
     return Advice(system, why, command, features)
 
 
-def _system(task: Task) -> tuple[str, str]:
+def _given(task: Task) -> list[str]:
+    """What names a task on a command line, with what was said of its environment."""
+    made = ["--task", task.name.removesuffix(task.view.suffix if task.view else "")]
+    made += [f"--import={each}" for each in modules_of(task)]
+    made += [f"--env={each}" for each in task.given_arguments]
+    if spec_of(task).max_episode_steps != task.max_episode_steps:
+        made.append(f"--episode-steps={task.max_episode_steps}")
+    low, high = task.action_low, task.action_high
+    try:
+        own = _own(task, ())
+        is_own = (own.action_low, own.action_high) == (low, high)
+    except InputError:  # it has none
+        is_own = False
+    if not is_own:
+        bounds = [f"{a:g}..{b:g}" for a, b in zip(low, high, strict=True)]
+        made.append(f"--action-bounds={','.join(bounds if len({*bounds}) > 1 else bounds[:1])}")
+    return made + [f"--missing={task.missing}"] * bool(task.missing)
+
+
+def _own(task: Task, bounds: Bounds) -> Task:
+    """The task as its environment describes itself."""
+    return describe(task.id, task.arguments, task.max_episode_steps, action_bounds=bounds)
+
+
+def _system(task: Task, winds: bool) -> tuple[str, str]:
     """Coordinates where features jump or are longer and turned, else all features."""
     kinds = {each.kind for each in task.features}
     reasons = {
         "angles jump": any(each.is_full_turn for each in task.features),
+        "angles wind beyond a full turn": winds,
         "a quaternion has two signs": "quaternion" in kinds,
         "offsets have a length and a direction": "offset" in kinds,
     }
@@ -84,7 +116,7 @@ def _system(task: Task) -> tuple[str, str]:
             return "coordinates", why
     except InputError:
         pass
-    return "full", "no feature is known to jump"
+    return "full", "no feature is known to jump or wind"
 
 
 def _found(seen: Seen, shapes: Shapes) -> tuple[Feature, ...]:

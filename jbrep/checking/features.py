@@ -16,6 +16,7 @@ WORST_FIRST = {  # kinds of findings
     "delay": "actions act late",
     "hidden": "one observation isn't enough",
     "wraps": "wraps",
+    "winds": "winds beyond a full turn",
     "signs": "a quaternion changes its sign",
     "degrees": "in degrees",
     "world": "where the robot is in the world doesn't matter",
@@ -110,6 +111,7 @@ def shapes(seen: Seen) -> tuple[Shapes, list[Finding]]:
     idle = [*flat, *copies]
     others = [i for i in range(len(features)) if i not in (*idle, *turns)]
     found += [each for i in others for each in (_degrees(seen, i), _saturated(seen, i)) if each]
+    found += [each for i in others if (each := _winds(seen, i))]
     return Shapes(turns, [*flips], idle), [*found, *_scales(seen, others)]
 
 
@@ -152,6 +154,14 @@ def _wraps(seen: Seen, i: int, turn: Turn) -> Finding:
     else:
         fix = "give its cosine and sine in the environment"
     return Finding("wraps", (feature.name,), why, fix, turn._asdict())
+
+
+def _winds(seen: Seen, i: int) -> Finding | None:
+    feature, low, high = seen.task.features[i], seen.before[:, i].min(), seen.before[:, i].max()
+    if not feature.is_angle or high - low <= 2 * np.pi:
+        return None
+    why = f"goes from {low:.3g} to {high:.3g} rad: one pose has several values"
+    return Finding("winds", (feature.name,), why, "--encoder coordinates: cosine and sine are one")
 
 
 def _in_radians(name: str) -> str:

@@ -1,10 +1,12 @@
 """Tasks, collecting data sets of them, and working with those."""
 
+import shlex
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
+import click
 from msgspec import Meta
 
 from jbrep import api
@@ -35,6 +37,9 @@ def env(task: str, /, *, as_json: AsJson = False, **options: Annotated[Any, desc
 @command("check Hopper-v5 --write features.toml")
 def _check(as_json: AsJson = False, **options: Annotated[Any, api.check]) -> None:
     found = api.check(options.pop("task", None), **options)
+    if (given := click.get_current_context().params.get("features")) and not options.get("write"):
+        command = found.advice.command.replace("features.toml", shlex.quote(str(given)))
+        found = found._replace(advice=found.advice._replace(command=command))
     say_json(found.plain()) if as_json else say(found.text(terminal_width()))
     for what, path in (("features file", options.get("write")), ("page", options.get("out"))):
         if path:
