@@ -219,9 +219,9 @@ def import_data(
     for (noun, what), count in opened.changes().items():
         say(f"{counted(count, noun)} {what}")
     if manifest.settings.unrewarded:
-        say("no rewards: what needs some will say so; --reward can make them", err=True)
+        say("no rewards: add some with --reward COLUMN or module:function", err=True)
     if not (task or opened.task):
-        line = f"{manifest.task.name} is made from the data alone: {opened.why_no_task}"
+        line = f"{manifest.task.name}: {opened.why_no_task}; jbrep clone learns from it, rl can't"
         say(line, err=True)
     _report_size(out, manifest)
 

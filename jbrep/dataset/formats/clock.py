@@ -85,16 +85,21 @@ def _resampled(
     count = math.ceil(length - _LATE) if has_final else int(length + _SLACK) + 1
     grid = begin + np.arange(count) / rate
     is_linear = layout.fill == "linear"
-    columns = [
-        _signal(grid, time, column, layout, is_linear and i < size, leaves[i], counts)
-        for i, column in enumerate(values.T)
-    ]
+    columns, old = zip(
+        *(
+            _signal(grid, time, column, layout, is_linear and i < size, leaves[i], counts)
+            for i, column in enumerate(values.T)
+        ),
+        strict=True,
+    )
     even = np.stack(columns, axis=1)
     whole = np.isfinite(even).all(axis=1)
     how = "interpolated" if is_linear else "by the latest readings"
     counts["row", f"at {rate:g} Hz, {how}"] += count
-    stale = f"of these without a reading of each column within {layout.gap} s: left out"
-    counts["row", stale] += int((~whole).sum())
+    silent = f"dropped, as a column was silent for more than {layout.gap} s"
+    counts["row", silent] += int((~whole).sum())
+    held = "of these with a reading older than two of its usual intervals, up to --gap"
+    counts["row", held] += int((whole & np.any(old, axis=0)).sum())
     for first, end in stretches(whole):
         some = even[first:end]
         part = {"observation": some[:, :size], "action": some[:, size:]}
@@ -115,8 +120,8 @@ def _signal(
     is_linear: bool,
     leaf: Leaf,
     counts: Counts,
-) -> Array:
-    """A column on the clock; NaN where it has no reading, or they are too far away."""
+) -> tuple[Array, NDArray[np.bool_]]:
+    """A column on the clock, NaN where no reading is near enough, and whether one is old."""
     some, step = np.isfinite(values), 1 / (layout.rate or 1.0)
     time, values, slack = time[some], values[some], _SLACK * step
     own = None if is_linear else timestep_of(np.diff(time))
@@ -137,7 +142,8 @@ def _signal(
             )
             counts["reading", f"{bursts}; a higher --rate keeps more"] += passed
     even[age > (layout.gap or np.inf) + slack] = np.nan
-    return even
+    usual = max(step, usual_step(np.diff(time)) or 0.0)
+    return even, age > 2 * usual + slack
 
 
 def same_clock(one: float | None, other: float | None) -> bool:

@@ -35,7 +35,7 @@ Array = NDArray[Any]
 _SIGNALS = ("observation", "action", "reward")
 _EXACT = ("time", "episode")  # of which no digit may be lost
 _ALIKE = ("task", "features", "has_rewards", "action_bounds", "subtracted")  # of several sources
-_LAST = ("row", "after the last action of an episode, or alone: no step begins there")
+_LAST = ("row", "at the end of an episode, which has no next state: dropped")
 
 
 class Source:

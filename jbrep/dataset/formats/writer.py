@@ -229,7 +229,7 @@ def _survey(source: Source, missing: str) -> _Survey:
         told = f"{source.name} had {counted(counts['missing'], 'missing reading')} ({missing})"
         told += f": {counted(counts['left'], 'step')} left out" if counts["left"] else ""
         warnings.warn(told, Notice, 2)
-    if counts["cut"]:
+    if counts["cut"] and not source.changes():  # which say so
         told = f"the last step of {counted(counts['cut'], 'episode')} of {source.name} is left out"
         warnings.warn(f"{told}: what was observed after it isn't known", Notice, 2)
     if signals is None:
