@@ -181,13 +181,12 @@ def collect(
     num_envs: NumEnvs = 100,
     threads: Threads = None,
     retries: Retries = 0,
-    backend: Backend = "local",
 ) -> "Dataset":
     """Collect the states that a policy visits.
 
     The same again resumes an unfinished data set and leaves a finished one as it is; with more
-    `steps` it extends it, to the data that as many at once give. Neither the number of environments
-    or threads nor the backend changes the data. A robot that exists once needs `threads` 1. Whole
+    `steps` it extends it, to the data that as many at once give. The number of environments or
+    threads doesn't change the data. A robot that exists once needs `threads` 1. Whole
     shards are kept whatever happens. The policy of a run is kept with the data as it is at the
     start, also if the run goes on.
 
@@ -225,7 +224,7 @@ def collect(
         if part["kind"] == TRAINED and exists(folder / part["file"]):
             acts = f"{part['run']} acts as it did at step {part['step']:,}"
             _note(f"{acts}, which {folder / part['file']} keeps")
-    run(settings, folder, num_envs, threads, backend, actor, retries)
+    run(settings, folder, num_envs, threads, actor, retries)
     return Dataset(folder)
 
 

@@ -1,4 +1,4 @@
-"""Data sets and studies on a Ray cluster: they outlive its nodes."""
+"""Studies on a Ray cluster: they outlive its nodes."""
 
 import os
 import subprocess
@@ -8,25 +8,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small import contents
-from test_any_collect import some
 from test_study import TINY
 
-from jbrep.collecting import collect
-from jbrep.envs import describe
 from jbrep.studies import runner
 from jbrep.studies.plan import Plan
 from jbrep.studies.runner import work
 from jbrep.studies.tables import read_tables, write_tables
 
 ray = pytest.importorskip("ray")
-DATA = some(steps=12_000, shard_episodes=50)
 STUDY = TINY.replace(seeds=(0,), steps=1000, evaluate_every=1000)
 
 
 @pytest.mark.slow
-def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
-    """One cluster for both: it takes seconds to start."""
+def test_on_a_cluster_that_loses_a_node_a_study_comes_to_the_same_end(tmp_path):
     told = subprocess.run(
         [sys.executable, Path(__file__).parent / "helpers" / "cluster.py", tmp_path],
         capture_output=True,
@@ -35,8 +29,6 @@ def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
         env={**os.environ, "HOME": str(tmp_path)},  # where Ray writes
     )
     assert told.returncode == 0, told.stderr[-3000:]
-    collect(DATA, tmp_path / "data-here", num_threads=1)
-    assert contents(tmp_path / "data") == contents(tmp_path / "data-here")
     plan = Plan(STUDY, tmp_path / "study-here")
     assert {work(plan.assigned(cell)).status for cell in plan.cells} == {"finished"}
     folders = (tmp_path / "study", plan.folder)
@@ -45,19 +37,6 @@ def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
     for ours, theirs in zip(*(read_tables(each).curves() for each in folders), strict=True):
         assert (ours.label, ours.settings) == (theirs.label, theirs.settings)
         np.testing.assert_array_equal(ours.returns, theirs.returns)
-
-
-@pytest.mark.slow
-def test_data_from_a_cluster_are_the_same(tmp_path, monkeypatch):
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setattr("jbrep.envs.names._imported", [])
-    made = some(describe("Pendulum-v1", episode_steps=20), steps=100)
-    collect(made, tmp_path / "here", num_threads=1)
-    try:
-        collect(made, tmp_path / "there", num_threads=1, backend="ray")
-    finally:
-        ray.shutdown()
-    assert contents(tmp_path / "there") == contents(tmp_path / "here")
 
 
 def test_runs_whose_workers_are_killed_say_so(tmp_path, monkeypatch):

@@ -43,7 +43,6 @@ def test_neither_environments_nor_threads_change_a_byte(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "how", "named"),
     [
-        ({}, {"backend": "slurm"}, "slurm"),
         ({}, {"num_envs": 0}, "at least 1"),
         ({}, {"num_threads": 0}, "at least 1"),
         ({"policy": {"kind": "sprint"}}, {}, "sprint"),

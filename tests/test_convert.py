@@ -169,8 +169,6 @@ def test_a_run_on_it_keeps_it_and_its_policy_is_one_model(run, tmp_path):
     export_policy(policy, tmp_path / "it.onnx")
     action = played(tmp_path / "it.onnx")["action"]
     np.testing.assert_allclose(action, policy(ROWS), rtol=1e-5, atol=1e-6)
-    with pytest.raises(InputError, match="the encoder mine is an ONNX model"):
-        export_policy(policy, tmp_path / "it.pt2", "torch")
 
 
 class Wrong(nn.Module):

@@ -6,9 +6,8 @@ import runpy
 import numpy as np
 import onnxruntime
 import pytest
-import torch
 from command import jbrep, mistake
-from test_controller import TASK, controller_of, difference_over_an_episode, randomised
+from test_controller import controller_of, difference_over_an_episode, randomised
 
 from jbrep.envs.description import describe
 from jbrep.errors import InputError
@@ -38,16 +37,6 @@ def test_an_exported_policy_acts_as_its_run(algorithm, encoder, tmp_path):
     worst, spread = difference_over_an_episode(trained, act)
     assert worst < 1e-6
     assert spread > 1e-3
-
-
-def test_a_program_of_torch_needs_torch_alone(tmp_path):
-    controller = controller_of(randomised("ppo", "symmetry"))
-    export(controller, tmp_path / "it.pt2", "torch")
-    extra = {"jbrep": ""}
-    program = torch.export.load(tmp_path / "it.pt2", extra_files=extra).module()
-    rows = np.random.default_rng(0).normal(size=(5, TASK.size)).astype(np.float32)
-    np.testing.assert_allclose(program(torch.from_numpy(rows)), controller(rows), atol=1e-6)
-    assert json.loads(extra["jbrep"])["task"] == "move_to_pose"
 
 
 def test_what_a_file_says_of_its_policy():

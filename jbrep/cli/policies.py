@@ -58,10 +58,9 @@ def export(
     out: NewFile,
     *,
     task: TaskName = None,
-    form: Annotated[str, Meta(extra={"option": "format"})] = "onnx",
     with_example: bool = False,
 ) -> None:
-    """Write a policy as one model, from raw observations to actions.
+    """Write a policy as one ONNX model, from raw observations to actions.
 
     POLICY is the folder of a run, a policy's file, or trained, which ships and needs a --task.
     Scaling, encoder, running normalisation, network and bounds are all in the model; names, units,
@@ -69,7 +68,6 @@ def export(
     the run's action_repeat says.
 
     Args:
-        form: either onnx, or torch for a program of torch.export.
         with_example: write a control loop beside it, which checks sensors and needs no jbrep.
     """
     from jbrep.envs.description import describe
@@ -89,18 +87,15 @@ def export(
     loop = out.with_name(f"{out.stem}_loop.py")
     if with_example:
         write_new(loop, EXAMPLE.read_bytes())
-    write(controller, out, form)
+    write(controller, out)
     said, own = described(controller), controller.task
     rate = "" if said["rate"] is None else f", {said['rate']:g} times a second"
     say(f"{out}: {own.size} numbers of {own.name} to {own.action_size}{rate}")
     if with_example:
         say(f"run it with python {loop} {out}")
-    if form == "onnx":
-        modules = [f"--import={module}" for module in modules_of(own)]
-        check = ["jbrep", "evaluate-policy", str(out), "--beside", policy, *modules]
-        say(f"check it with {shlex.join(check)}")
-    else:
-        say(f"open it with torch.export.load({str(out)!r}).module()")
+    modules = [f"--import={module}" for module in modules_of(own)]
+    check = ["jbrep", "evaluate-policy", str(out), "--beside", policy, *modules]
+    say(f"check it with {shlex.join(check)}")
 
 
 @command("evaluate-policy runs/a --episodes 100")

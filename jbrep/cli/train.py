@@ -33,6 +33,7 @@ class _Making(Command):
         for option, value in pairwise(args):
             if option == "--kind":
                 choose(value, KINDS, "kind")
+                ctx.meta["kind"] = value  # help shows its settings alone
         return super().parse_args(ctx, args)
 
     def options(self) -> list[click.Parameter]:
@@ -48,37 +49,15 @@ class _Making(Command):
     @cached_property
     def _settings(self) -> list[click.Option]:
         """An option for each setting, those of most kinds first."""
+        return self._settings_of(self._methods)
+
+    def _settings_of(self, methods: "Mapping[str, type[Method]]") -> list[click.Option]:
         taking: dict[str, dict[str, Key]] = {}  # by setting and kind
-        for kind, method in self._methods.items():
+        for kind, method in methods.items():
             for key in keys_of(method):
                 taking.setdefault(key.name, {})[kind] = key
         by_use = sorted(taking.items(), key=lambda setting: -len(setting[1]))
-        return [self._made(name, keys) for name, keys in by_use]
-
-    def _made(self, name: str, taking: Mapping[str, Key]) -> click.Option:
-        key = next(iter(taking.values()))
-        kind, words = bare(key.kind), f"{key.help}{self._use(taking)}"
-        if isinstance(kind, inspect.BoolType):
-            return click.Option([option_name(name)], is_flag=True, default=None, help=words)
-        several = name == "latent" or isinstance(kind, inspect.CollectionType | inspect.DictType)
-        metavar = "VALUE..." if several else "VALUE"
-        return click.Option([option_name(name)], multiple=several, metavar=metavar, help=words)
-
-    def _use(self, taking: Mapping[str, Key]) -> str:
-        """Which kinds take a setting, and its default: [slow: 10; forward: 1,5,10,20]."""
-        kinds: dict[str, list[str]] = {}  # by default
-        for kind, key in taking.items():
-            kinds.setdefault(_shown(key), []).append(kind)
-        others = [kind for kind in self._methods if kind not in taking]
-        if list(kinds) == [""] and not others:
-            return ""  # all take it, and none has a default
-        said = {", ".join(each): default for default, each in kinds.items()}
-        if len(kinds) == 1 and len(others) <= _FEW:
-            said = {f"all but {', '.join(others)}" if others else "default": next(iter(kinds))}
-        elif not others and len(most := max(kinds.values(), key=len)) > _FEW:
-            said = {"others" if each == most else ", ".join(each): d for d, each in kinds.items()}
-        parts = [f"{who}: {default}" if default else who for who, default in said.items()]
-        return f"  [{'; '.join(parts)}]"
+        return [_made(name, keys, methods) for name, keys in by_use]
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the command's options, the kinds, and the settings."""
@@ -86,16 +65,47 @@ class _Making(Command):
         def told(options: Iterable[click.Parameter]) -> list[tuple[str, str]]:
             return [record for each in options if (record := each.get_help_record(ctx))]
 
+        methods, settings = self._methods, self._settings
+        if kind := ctx.meta.get("kind"):
+            methods = {kind: methods[kind]}
+            settings = self._settings_of(methods)
         sections = {
             "Options": told(p for p in self.get_params(ctx) if p not in self._settings),
-            "Kinds": [(kind, method.words()) for kind, method in self._methods.items()],
-            "Settings": told(self._settings),
+            "Kinds": [(kind, method.words()) for kind, method in methods.items()],
+            "Settings": told(settings),
         }
-        if len(self._methods) == 1:
+        if len(self.kinds) == 1:
             del sections["Kinds"]
         for title, rows in sections.items():
             with formatter.section(title):
                 formatter.write_dl(rows)
+
+
+def _made(name: str, taking: Mapping[str, Key], kinds: Iterable[str]) -> click.Option:
+    key = next(iter(taking.values()))
+    kind, words = bare(key.kind), f"{key.help}{_use(taking, kinds)}"
+    if isinstance(kind, inspect.BoolType):
+        return click.Option([option_name(name)], is_flag=True, default=None, help=words)
+    several = name == "latent" or isinstance(kind, inspect.CollectionType | inspect.DictType)
+    metavar = "VALUE..." if several else "VALUE"
+    return click.Option([option_name(name)], multiple=several, metavar=metavar, help=words)
+
+
+def _use(taking: Mapping[str, Key], every: Iterable[str]) -> str:
+    """Which kinds take a setting, and its default: [slow: 10; forward: 1,5,10,20]."""
+    kinds: dict[str, list[str]] = {}  # by default
+    for kind, key in taking.items():
+        kinds.setdefault(_shown(key), []).append(kind)
+    others = [kind for kind in every if kind not in taking]
+    if list(kinds) == [""] and not others:
+        return ""  # all take it, and none has a default
+    said = {", ".join(each): default for default, each in kinds.items()}
+    if len(kinds) == 1 and len(others) <= _FEW:
+        said = {f"all but {', '.join(others)}" if others else "default": next(iter(kinds))}
+    elif not others and len(most := max(kinds.values(), key=len)) > _FEW:
+        said = {"others" if each == most else ", ".join(each): d for d, each in kinds.items()}
+    parts = [f"{who}: {default}" if default else who for who, default in said.items()]
+    return f"  [{'; '.join(parts)}]"
 
 
 def _shown(key: Key) -> str:

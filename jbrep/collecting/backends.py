@@ -1,9 +1,9 @@
-"""Where episodes are made: in this process, in others on this machine, or on a Ray cluster."""
+"""Where episodes are made: in this process, or in others."""
 
 import math
 import pickle
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -17,9 +17,9 @@ from jbrep.dataset.schema import Columns
 from jbrep.envs.make import close_kept, is_batched
 from jbrep.envs.names import import_modules, imported_modules, spec_of
 from jbrep.envs.recording import Tick
-from jbrep.errors import InputError, first_line
+from jbrep.errors import InputError
 from jbrep.machine import cores
-from jbrep.pool import ATTEMPTS, on_cluster, side_by_side, stop_requested
+from jbrep.pool import ATTEMPTS, side_by_side, stop_requested
 
 _PIECES = 10  # of a shard: what a worker makes at a time
 _AHEAD = 4  # pieces for each worker, begun or held until those before are made
@@ -122,38 +122,3 @@ def _whole(made: Made) -> Iterator[Columns]:
 def _stop_on_request(steps: int) -> None:
     if stop_requested():
         raise SystemExit
-
-
-def on_ray(simulator: Simulator) -> Produce:
-    """Pieces made side by side on the Ray cluster that RAY_ADDRESS names, or else on a local one.
-
-    Only this process writes to the data set's folder. The pieces of a node that dies are made
-    again on another.
-    """
-
-    def produce(growth: Growth, tick: Tick) -> Iterator[Columns]:
-        import ray
-
-        make = on_cluster(make_episodes, simulator.num_threads)
-        alone = replace(simulator, num_envs=1, num_threads=1)
-        known = imported_modules(), spec_of(simulator.settings.task)
-        ahead = _Ahead(growth)
-        try:
-            while True:
-                most = _AHEAD * int(ray.cluster_resources().get("CPU", 1))
-                while coming := ahead.next(most):
-                    ahead.waiting.append(make.remote(known, alone, coming))
-                made = ray.get(ahead.waiting[0])
-                ahead.waiting.popleft()
-                yield from _whole(made)
-        except ray.exceptions.RayError as error:
-            reason = first_line(error)
-            raise InputError(f"the cluster could not make episodes: {reason}") from error
-        finally:
-            for job in ahead.waiting:
-                ray.cancel(job, force=True)
-
-    return produce
-
-
-BACKENDS: dict[str, Callable[[Simulator], Produce]] = {"local": local, "ray": on_ray}

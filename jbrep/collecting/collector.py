@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jbrep.collecting.backends import BACKENDS
+from jbrep.collecting.backends import local
 from jbrep.collecting.policies import Policy, make_policy
 from jbrep.collecting.replay import replay_problems
 from jbrep.collecting.shards import NUM_ENVS, SHARD_ROWS, Growth, Produce, Simulator
@@ -24,7 +24,7 @@ from jbrep.dataset.manifest import (
 from jbrep.dataset.schema import EPISODES, DataSettings
 from jbrep.envs.environments import check_counts
 from jbrep.envs.make import is_batched
-from jbrep.errors import DamageError, InputError, choose, differences
+from jbrep.errors import DamageError, InputError, differences
 from jbrep.progress import Progress
 from jbrep.records.storage import check_space, exclusive, exists, make_folder, write_whole
 from jbrep.text import counted
@@ -39,23 +39,21 @@ def collect(
     folder: Path,
     num_envs: int = NUM_ENVS,
     num_threads: int | None = None,
-    backend: str = "local",
     policy: Policy | None = None,
     retries: int = 0,
 ) -> Manifest:
     """Collect a data set, or what is missing of it; `jbrep.collect` says what its arguments are.
 
-    The bytes depend neither on the number of environments or threads, nor on the backend, nor on
-    whether a data set is collected at once or extended. Before one that is there is continued, an
-    episode of it is played again: it must be the same to the last bit, where the environment is
-    reproducible.
+    The bytes depend neither on the number of environments or threads, nor on whether a data set is
+    collected at once or extended. Before one that is there is continued, an episode of it is played
+    again: it must be the same to the last bit, where the environment is reproducible.
     """
     policy = policy or make_policy(settings.policy)
     policy.begin(settings.task, [0])  # may refuse the task
     settings = settings.replace(policy=policy.settings())
     check_counts(num_envs, num_threads)
     simulator = Simulator(settings, policy, num_envs, num_threads, retries)
-    produce = choose(backend, BACKENDS, "backend")(simulator)
+    produce = local(simulator)
 
     def check(wanted: Manifest) -> None:
         """Play an episode of the data set again before it is continued."""

@@ -1,11 +1,10 @@
 """Trained policies for a robot: functions of what its sensors say, in NumPy alone, and files.
 
-Any runtime of ONNX, or torch alone, computes actions with such a file.
+Any runtime of ONNX computes actions with such a file.
 """
 
 import hashlib
-import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from jbrep.coordinates import library_of
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder, load
-from jbrep.encoders.layers import ACTIVATIONS, ONNX, Layer, activate, dense, run
+from jbrep.encoders.layers import ACTIVATIONS, Layer, activate, dense, run
 from jbrep.envs.task import most_held
 from jbrep.envs.view import Window
 from jbrep.errors import InputError, choose, listed, refusing
@@ -36,10 +35,7 @@ _RENORM_EPSILON = 1e-3  # that CrossQ's batch renormalisation adds to the varian
 
 
 class Acting(NamedTuple):
-    """What a policy computes with, all NumPy's arrays or all torch tensors.
-
-    Written once for NumPy, torch and ONNX.
-    """
+    """What a policy computes with, written once for NumPy and ONNX."""
 
     # mean (l,) and standard deviation (l,) of what the network sees, if it is normalised by them
     statistics: tuple[Any, Any] | None
@@ -50,20 +46,8 @@ class Acting(NamedTuple):
     high: Any
     is_squashed: bool  # whether actions are squashed; others are clipped
 
-    def in_torch(self) -> "Acting":
-        """The same with torch tensors."""
-        from torch import tensor
-
-        return Acting(
-            self.statistics and (tensor(self.statistics[0]), tensor(self.statistics[1])),
-            tuple(Layer(tensor(w), tensor(b), activation) for w, b, activation in self.network),
-            tensor(self.low),
-            tensor(self.high),
-            self.is_squashed,
-        )
-
     def actions(self, seen: Any) -> Any:
-        """Actions (..., k) of latents (..., l): arrays, torch tensors, or rows of a model."""
+        """Actions (..., k) of latents (..., l): arrays, or rows of a model."""
         if self.statistics:
             mean, deviation = self.statistics
             seen = ((seen - mean) / deviation).clip(-CLIP, CLIP)
@@ -289,8 +273,8 @@ def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
         return Controller(settings, encoder, weights, statistics)
 
 
-def export(controller: Controller, path: Path, form: str = "onnx") -> None:
-    """Write a policy as one model from observations, as the robot gives them, to actions.
+def export(controller: Controller, path: Path) -> None:
+    """Write a policy as one ONNX model from observations, as the robot gives them, to actions.
 
     Its input is `observation`, (rows, d) float32 in the units of the task's features; its output is
     `action`, (rows, k) in those of the actuators. `described` is in its metadata, as `jbrep`. Each
@@ -302,9 +286,7 @@ def export(controller: Controller, path: Path, form: str = "onnx") -> None:
     Args:
         controller: of the policy.
         path: a new file.
-        form: onnx, or torch for a program of torch.export (.pt2).
     """
-    write = choose(form, _FORMS, "format")
     if not isinstance(controller.encoder, Encoder):
         raise InputError(
             f"the encoder {controller.encoder.name} is code, which a model can't hold: give the "
@@ -312,7 +294,7 @@ def export(controller: Controller, path: Path, form: str = "onnx") -> None:
         )
     if exists(path):  # known before the work
         raise taken(path)
-    write_new(path, write(controller))
+    write_new(path, _onnx(controller))
 
 
 def described(controller: Controller) -> dict[str, Any]:
@@ -368,33 +350,3 @@ def _onnx(controller: Controller) -> bytes:
     model.metadata_props.add(key=SEAL, value=NOT_SEALED)
     content: bytes = model.SerializeToString(deterministic=True)
     return content.replace(NOT_SEALED.encode(), hashlib.sha256(content).hexdigest().encode())
-
-
-def _torch(controller: Controller) -> bytes:
-    import io
-
-    import torch
-
-    encoder, acting = controller.encoder, controller.acting.in_torch()
-    assert isinstance(encoder, Encoder)
-    if any(layer.activation == ONNX for layer in encoder.encoder):
-        raise InputError(
-            f"the encoder {encoder.name} is an ONNX model, which torch can't hold: choose the "
-            "format onnx"
-        )
-
-    class Policy(torch.nn.Module):
-        def forward(self, observation: torch.Tensor) -> torch.Tensor:
-            return acting.actions(encoder.encode(observation))
-
-    rows = torch.export.Dim("rows")
-    program = torch.export.export(
-        Policy(), (torch.zeros(2, controller.task.size),), dynamic_shapes=({0: rows},)
-    )
-    content = io.BytesIO()
-    metadata = {"jbrep": json.dumps(described(controller))}
-    torch.export.save(program, content, extra_files=metadata)
-    return content.getvalue()
-
-
-_FORMS: dict[str, Callable[[Controller], bytes]] = {"onnx": _onnx, "torch": _torch}

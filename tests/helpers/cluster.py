@@ -1,4 +1,4 @@
-"""A study and data on a Ray cluster that loses a node: python tests/helpers/cluster.py OUT."""
+"""A study on a Ray cluster that loses a node: python tests/helpers/cluster.py OUT."""
 
 import sys
 import time
@@ -10,7 +10,6 @@ from pathlib import Path
 import ray
 from ray.cluster_utils import Cluster
 
-from jbrep.collecting import collect
 from jbrep.studies.plan import PROGRESS, Plan
 from jbrep.studies.runner import on_ray, run_study
 
@@ -49,19 +48,15 @@ def loses_a_node(cluster, work, is_at_work):
     return result.result()
 
 
-def run(study, study_folder, data, data_folder):
-    """Run a study, and collect data."""
-    learn = partial(run_study, Plan(study, study_folder), on_ray, 2)
-    make = partial(collect, data, data_folder, backend="ray")
+def run(plan):
+    """Run a study."""
     with running_cluster() as cluster:
-        assert loses_a_node(cluster, learn, lambda: any(study_folder.rglob(PROGRESS))) == 0
-        first = data_folder / "shard-00000.h5"
-        assert loses_a_node(cluster, make, first.exists).complete
+        learn = partial(run_study, plan, on_ray, 2)
+        assert loses_a_node(cluster, learn, lambda: any(plan.folder.rglob(PROGRESS))) == 0
 
 
 if __name__ == "__main__":
     sys.path.append(str(Path(__file__).parent.parent))
-    from test_cluster import DATA, STUDY
+    from test_cluster import STUDY
 
-    folder = Path(sys.argv[1])
-    run(STUDY, folder / "study", DATA, folder / "data")
+    run(Plan(STUDY, Path(sys.argv[1]) / "study"))
