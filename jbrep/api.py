@@ -569,9 +569,19 @@ def _note_limits(settings: "RunSettings") -> None:
     """Say of a run what can't come of it."""
     if settings.steps <= settings.learns_from:
         _note(
-            f"{settings.learner} learns from step {settings.learns_from:,} on: "
-            f"{settings.steps:,} steps leave the policy as it was drawn; take more, or another "
-            "preset",
+            f"{settings.learner} learns from step {settings.learns_from:,} on: nothing is learned "
+            f"in {settings.steps:,} steps; give more, or another preset",
+            level=4,
+        )
+    from jbrep.encoders import FULL
+
+    features = settings.environment.features
+    free = [each.name for each in features if each.low is None or each.high is None]
+    is_seen = settings.representation == FULL and not settings.hyperparameters.normalize
+    if is_seen and 0 < len(free) < len(features):
+        _note(
+            f"{len(free)} of {len(features)} features have no usual range ({free[0]}, ...) and "
+            "aren't scaled, the others are: give ranges in a file of `features`, or `normalize`",
             level=4,
         )
     if not settings.environment.reproducible:

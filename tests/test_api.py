@@ -45,7 +45,7 @@ def test_from_states_to_a_policy(home):
 
 def test_what_is_too_short_to_learn_or_not_to_be_written_is_told_first(home, tmp_path, monkeypatch):
     task = jbrep.Dataset(home / "data").task
-    with pytest.warns(Notice, match="sac-modern learns from step 1,000 on: 256 steps leave"):
+    with pytest.warns(Notice, match="sac-modern learns from step 1,000 on: nothing is learned"):
         jbrep.train(
             task, tmp_path / "a", **QUICK | {"steps": 256, "evaluate_every": 256}, preset="modern"
         )
