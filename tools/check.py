@@ -20,7 +20,7 @@ def main() -> None:
     parser.add_argument("robots", nargs="*", default=ROBOTS)
     parser.add_argument("--steps", type=int, default=44_000)
     given = parser.parse_args()
-    sys.path.insert(0, str(ROOT / "examples/check"))
+    sys.path.insert(0, str(ROOT / "examples/robots"))
     import robots  # type: ignore[import-not-found]  # noqa: F401  # it registers the last two
 
     print("| task | found | begin with |\n|---|---|---|", flush=True)

@@ -44,7 +44,8 @@ class RawCartPole(gymnasium.Env):
         spin = (9.8 * sine - cosine * push) / (0.5 * (4 / 3 - 0.1 * cosine**2 / 1.1))
         force = push - 0.05 * spin * cosine / 1.1
         self.state = self.state + self.dt * np.array([v, force, turn, spin])
-        reward = float(np.cos(self.state[2]) - 0.05 * self.state[0] ** 2)
+        height = (1 + np.cos(self.state[2])) / 2
+        reward = float(height * max(0, 1 - (self.state[0] / 2.4) ** 2))  # none is below 0
         return self.seen(), reward, bool(abs(self.state[0]) > 2.4), False, {}
 
 

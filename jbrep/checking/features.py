@@ -143,7 +143,7 @@ def _wraps(seen: Seen, i: int, turn: Turn) -> Finding:
         f"else it moves by at most {turn.moves:.2g}"
     )
     if feature.is_angle:
-        fix = "--encoder coordinates, or symmetry: cosine and sine have no jump"
+        fix = "--encoder coordinates: cosine and sine have no jump"
     elif (low, turn.size) in TURNS[:2]:
         fix = (
             f'features.toml: kind = "angle", unit = "rad", low = {low:.17g}, high = {high:.17g}, '
@@ -161,7 +161,7 @@ def _winds(seen: Seen, i: int) -> Finding | None:
     if not feature.is_angle or high - low <= 2 * np.pi:
         return None
     why = f"goes from {low:.3g} to {high:.3g} rad: one pose has several values"
-    return Finding("winds", (feature.name,), why, "--encoder coordinates: cosine and sine are one")
+    return Finding("winds", (feature.name,), why, "--encoder coordinates: cosine and sine don't")
 
 
 def _in_radians(name: str) -> str:
