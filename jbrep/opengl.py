@@ -1,5 +1,6 @@
 """OpenGL to render with: on which platform, and what must be loaded before it."""
 
+import importlib
 import os
 import sys
 from contextlib import suppress
@@ -30,10 +31,14 @@ def prepare_opengl() -> None:
 
 
 def find_opengl() -> None:
-    """Have MuJoCo look for OpenGL; call it before MuJoCo is first imported."""
+    """Have MuJoCo look for OpenGL, again where a user's module has imported it before."""
+    chosen = sys.modules.get("mujoco.rendering.classic.gl_context")
     prepare_opengl()
     try:
         import mujoco  # noqa: F401
+
+        if chosen:
+            importlib.reload(chosen)
     except (AttributeError, ImportError, RuntimeError) as error:
         raise no_opengl(error) from error
 
