@@ -47,7 +47,7 @@ def test_what_is_found_of_a_robot_and_what_its_command_needs(
     name, how, found, recommended, options
 ):
     made = jbrep.check(jbrep.describe(name, **how), steps=4_400)
-    kinds = {kind: () for kind in dict.fromkeys(each.kind for each in made.findings)}
+    kinds = dict.fromkeys(dict.fromkeys(each.kind for each in made.findings), ())
     for each in made.findings:
         kinds[each.kind] += each.features
     assert kinds == found
