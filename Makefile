@@ -27,18 +27,15 @@ $(READY_DEMO): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dm-control,learn,view]'
 	@touch $@
 
-demo: $(READY_DEMO) ## the whole job in minutes: collect, train and judge encoders, learn, report, record
+demo: $(READY_DEMO) ## the whole job in minutes: collect, train an encoder, learn, evaluate, report, record
 	rm -rf $(DEMO)
-	$(BIN)/jbrep collect --task face_direction --steps 20k --out $(DEMO)/data
-	$(BIN)/jbrep data info $(DEMO)/data
-	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 12 8 4 --out $(DEMO)/encoders
-	$(BIN)/jbrep evaluate --encoder $(DEMO)/encoders/dae-8.safetensors forward-8 --data $(DEMO)/data --out $(DEMO)/evaluation
-	@echo "\nfour agents, on the full state and on forward-8, an encoder that ships"
-	$(BIN)/jbrep study demo --out $(DEMO)/study
-	$(BIN)/jbrep rl --task face_direction --encoder symmetry --steps 100k --evaluate-every 50k --final-episodes 10 --out $(DEMO)/run
-	$(BIN)/jbrep inspect $(DEMO)/run --out $(DEMO)/run.rrd
+	$(BIN)/jbrep study demo --out $(DEMO)
+	$(BIN)/jbrep data info $(DEMO)/data/face_direction
+	$(BIN)/jbrep evaluate --encoder $(DEMO)/encoders/face_direction/dae-deep-8.safetensors --data $(DEMO)/data/face_direction --out $(DEMO)/evaluation
+	$(BIN)/jbrep report $(DEMO) --evaluation $(DEMO)/evaluation
+	$(BIN)/jbrep inspect $(DEMO)/runs/face_direction/small-sac/full/seed-0 --out $(DEMO)/run.rrd
 	@echo
-	@echo "the report: $(DEMO)/study/report.html"
+	@echo "the report: $(DEMO)/report.html"
 	@echo "an agent that has learned to turn: $(BIN)/rerun $(DEMO)/run.rrd"
 
 test: $(READY) ## the test suite, in minutes
