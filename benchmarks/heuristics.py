@@ -1,4 +1,4 @@
-"""Returns of the hand-written policies and of random drive: python benchmarks/heuristics.py."""
+"""Returns of the scripted policies and of random drive: python benchmarks/heuristics.py."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ def main() -> None:
         return random.uniform(-1, 1, (len(observation), 1))
 
     print(f"return of {EPISODES} episodes, seeds 0 to {EPISODES - 1}: median [10 %, 90 %]\n")
-    print(f"| {'task':18} | {'hand-written':16} | {'uniform random':16} |\n|---|---|---|")
+    print(f"| {'task':18} | {'scripted':16} | {'uniform random':16} |\n|---|---|---|")
     for task, policy in HEURISTICS.items():
         cells = []
         for candidate in (policy, uniform):

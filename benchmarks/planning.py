@@ -4,7 +4,7 @@
 
 Predictive sampling (Howell et al. 2022, arXiv 2212.00541): at every replanning, many copies of the
 robot are simulated for a while, half of them with the last plan and coloured noise, half with the
-hand-written policy and such noise; the drives of the best copy are carried out. It sees the true
+scripted policy and such noise; the drives of the best copy are carried out. It sees the true
 state and simulates the true physics, which no agent can: a reference, not a rival.
 """
 
@@ -31,7 +31,7 @@ class Planned(NamedTuple):
     """An episode that was planned."""
 
     planned: float  # its return
-    written: float  # that of the hand-written policy from the same start
+    written: float  # that of the scripted policy from the same start
     trained: float  # that of the trained policy that ships
     seconds: float  # of CPU time, which planning took
     steps: int  # of robots that were simulated
@@ -53,7 +53,7 @@ class Planner:
         robots.restore(**{name: np.repeat(each, copies, 0) for name, each in state.items()})
         noise, rewards = np.zeros((copies, 1)), np.empty((self.horizon, copies))
         quiet = np.ones((copies, 1))
-        quiet[[0, copies // 2]] = 0  # the last plan, and the hand-written policy, as they are
+        quiet[[0, copies // 2]] = 0  # the last plan, and the scripted policy, as they are
         taken = np.empty((self.horizon, copies))
         for step in range(self.horizon):
             noise = KEEP * noise + np.sqrt(1 - KEEP**2) * SIGMA * self._random.normal(
@@ -114,7 +114,7 @@ def main() -> None:
         f"{given.horizon} steps ahead every {given.held} steps\n"
     )
     print(
-        "| task | planned | hand-written | trained | CPU minutes an episode | robot-steps a step |"
+        "| task | planned | scripted | trained | CPU minutes an episode | robot-steps a step |"
     )
     print("|---|---|---|---|---|---|")
     for name in given.task:

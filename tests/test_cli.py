@@ -36,7 +36,7 @@ def test_a_run_from_training_to_its_returns(tmp_path):
         given = (*settings, "--encoder", "dae-8", "--evaluation-episodes", 1, "--out", run)
         said = jbrep("rl", *given).output
         told, number = " ".join(said.split()), r"(-?[\d.]+)"
-        beside = rf"standing still {number}, constant drive {number}, random {number}"
+        beside = rf"standing still {number}, constant action {number}, random {number}"
         found = re.search(rf"final return on dae-8 [a-z ]*: {number} \[.*; from .*{beside}", told)
         final = [each.episode_return for each in read_evaluations(run) if each.step >= 40]
         assert len(final) == 12

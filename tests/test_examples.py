@@ -156,7 +156,7 @@ def test_an_angle_with_and_without_its_jump(monkeypatch):
 
 
 def test_behaviour_of_policies_is_tabled_and_drawn(tmp_path, monkeypatch, capsys):
-    """A constant drive turns the motor one way; the heuristic goes where the target points."""
+    """A constant action turns the motor one way; the heuristic goes where the target points."""
     shorter = partial(describe, episode_steps=400)
     monkeypatch.setattr("jbrep.envs.describe", shorter)
     task = shorter("move_in_direction")

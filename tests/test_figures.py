@@ -15,8 +15,8 @@ from jbrep.stats import RunCurve, analyse
 
 STEPS = np.arange(0, 50_001, 10_000)
 FINAL = {"full": 900, "dae-8": 500, "pca-4": 300}
-PLAYED = {"face_direction": {"hand-written": [910.0, 950.0, 990.0]}}
-IN_TRAINING = {"face_direction": {"hand-written": 950.0}}
+PLAYED = {"face_direction": {"scripted": [910.0, 950.0, 990.0]}}
+IN_TRAINING = {"face_direction": {"scripted": 950.0}}
 GROUPS = [("face_direction", "ddpg"), ("face_direction", "sac"), ("move_to_pose", "sac")]
 
 
@@ -80,7 +80,7 @@ def test_curves_are_the_means_of_the_statistics(plots, found):
     for agents, curve in zip(group.agents, curves, strict=False):
         np.testing.assert_array_equal(curve, agents.curve["mean"])
     assert [text.get_text() for text in axes.texts] == [a.representation for a in group.agents]
-    assert set(lines["hand-written"].get_ydata()) == {950}
+    assert set(lines["scripted"].get_ydata()) == {950}
     assert set(lines["solved"].get_ydata()) == {900}
     bands = [path.get_paths()[0].get_extents() for path in axes.collections]
     assert bands[0].y1 == pytest.approx(max(group.agents[0].curve["p90"]))

@@ -1,6 +1,6 @@
 """The whole chain through the command line, against numbers that no rewrite may change.
 
-Physics, hand-written policies and closed forms give their numbers almost exactly; what is learned,
+Physics, scripted policies and closed forms give their numbers almost exactly; what is learned,
 and so depends on an order of sums, has tolerances. What one stage says is what the next one reads.
 """
 
@@ -127,7 +127,7 @@ def test_a_study_and_its_report(folder):
     assert len(returns(study / "returns.csv")) == 24
     references = {
         each: mean(returns(study / "references.csv", policy=each))
-        for each in ("standing still", "constant drive", "random", "hand-written")
+        for each in ("standing still", "constant action", "random", "scripted")
     }
     assert [*references.values()] == pytest.approx([10.5755, 36.7006, 5.7395, 52.45], rel=1e-3)
     found = json.loads((study / "findings.json").read_text())

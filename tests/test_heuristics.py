@@ -1,4 +1,4 @@
-"""The hand-written policies: pure functions of the observation that reach their returns."""
+"""The scripted policies: pure functions of the observation that reach their returns."""
 
 import numpy as np
 import pytest

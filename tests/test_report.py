@@ -58,7 +58,7 @@ STUDY = Study(
     evaluation_episodes=2,
     final_episodes=2,
 )
-POLICIES = ("standing still", "constant drive", "random", "hand-written")
+POLICIES = ("standing still", "constant action", "random", "scripted")
 TABLES = ("runs.json", "returns.csv", "references.csv")
 TRAP = "<script>document.title = 'run'</script>"
 
@@ -316,8 +316,8 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
     before = path.read_bytes()
     rows = list(csv.reader(before.decode().splitlines()))
     assert rows[0] == ["task", "policy", "episode", "return"]
-    policies = {"standing still": "still", "constant drive": "constant:drive=0.75"}
-    policies |= {"random": "uniform", "hand-written": "heuristic"}
+    policies = {"standing still": "still", "constant action": "constant:drive=0.75"}
+    policies |= {"random": "uniform", "scripted": "heuristic"}
     episodes = study.final_episodes
     assert [row[1] for row in rows[1:]] == [name for name in policies for _ in range(episodes)]
     task = plan.task("face_direction")

@@ -113,7 +113,7 @@ def test_the_tables_of_the_answer_are_those_on_the_pages(capsys, tmp_path):
     names, _, *rows = map(cells, table.splitlines())
     assert set(names[1:]) == set(tasks[1:])
     observed = ("full", "coordinates", "symmetry", "forward-8-symmetry", "dae-12")
-    blind = ("standing still", "constant drive", "random")
+    blind = ("standing still", "constant action", "random")
     for task, *column in zip(names[1:], *(row[1:] for row in rows), strict=True):
         best = max(means.get((policy, task), 0) for policy in blind)
         assert [int(each) for each in column] == [*(means[each, task] for each in observed), best]

@@ -27,7 +27,7 @@ DOCS = Path(__file__).parent.parent / "docs" / "verdicts.md"
 
 def in_no_time(policy, task, episodes):
     """What other policies might return."""
-    return [950.0 if policy == "hand-written" else STILL] * episodes
+    return [950.0 if policy == "scripted" else STILL] * episodes
 
 
 @pytest.fixture(scope="module")
@@ -100,11 +100,11 @@ def test_seeds_that_were_added_are_exploratory(reports):
 def test_there_is_no_verdict_over_policies_that_are_not_known(reports, tmp_path):
     shutil.copytree(reports[0].parent / "whole", tmp_path / "less")
     path = tmp_path / "less" / REFERENCE_RETURNS
-    path.write_text(re.sub(r".*constant drive.*\n", "", path.read_text()))
+    path.write_text(re.sub(r".*constant action.*\n", "", path.read_text()))
     adopt(tmp_path / "less" / RECORD, REFERENCE_RETURNS)
     found = on_face(read_tables(tmp_path / "less").analysis).values()
     assert {each.verdict for each in found} == {"undecided"}
-    assert all("constant drive" in each.reason for each in found)
+    assert all("constant action" in each.reason for each in found)
 
 
 def test_a_reader_gets_the_numbers_with_numpy_alone(reports, monkeypatch, capsys):

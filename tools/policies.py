@@ -55,7 +55,7 @@ def main() -> None:
         written, still = beside[task][LOOKING], beside[task][STILL]
         if {len(learned), len(written)} != {COUNTED}:
             sys.exit(
-                f"{run} has {len(learned)} episodes at last, the hand-written policy "
+                f"{run} has {len(learned)} episodes at last, the scripted policy "
                 f"{len(written)}: {COUNTED} of each are needed"
             )
         reached, least, most = (float(np.median(each)) for each in (learned, still, written))

@@ -1,4 +1,4 @@
-"""Search over the constants of a hand-written policy with CMA-ES.
+"""Search over the constants of a scripted policy with CMA-ES.
 
 python tools/tune_heuristics.py move_to_position --minutes 30
 

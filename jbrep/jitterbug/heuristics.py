@@ -1,4 +1,4 @@
-"""Hand-written policies, one for each task: observations (n, d) to actions (n, 1).
+"""Scripted policies, one for each task: observations (n, d) to actions (n, 1).
 
 The bug hops toward the bearing that its weight swings back and forth about, whichever way it faces,
 and turns when the weight spins in bursts. A policy chooses the bearing or the angle to turn by.

@@ -13,9 +13,9 @@ from jbrep.stats.runs import RunCurve, evaluated_run
 
 SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the gain of the baseline's median run
 SOLVED = "steps_to_solved"
-STILL, CONSTANT, RANDOM = "standing still", "constant drive", "random"  # blind baselines
+STILL, CONSTANT, RANDOM = "standing still", "constant action", "random"  # blind baselines
 BLIND = (STILL, CONSTANT, RANDOM)
-LOOKING = "hand-written"  # what tables call the scripted policy
+LOOKING = "scripted"  # what tables call the scripted policy
 STEPS_TO = (*(f"steps_to_{name}" for name in SHARES), SOLVED)
 _POINTS = 50  # of a performance profile, about, or half as many: round numbers
 _FAR = 1_000  # times the range of returns, beyond which a floor is no place to begin
