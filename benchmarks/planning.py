@@ -113,9 +113,7 @@ def main() -> None:
         f"returns of {given.episodes} episodes, median [least, most]; {given.copies} copies look "
         f"{given.horizon} steps ahead every {given.held} steps\n"
     )
-    print(
-        "| task | planned | scripted | trained | CPU minutes an episode | robot-steps a step |"
-    )
+    print("| task | planned | scripted | trained | CPU minutes an episode | robot-steps a step |")
     print("|---|---|---|---|---|---|")
     for name in given.task:
         each = [

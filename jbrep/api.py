@@ -292,12 +292,12 @@ def evaluate(
     policy: Acting | None = None,
     truth: "Dataset | str | Path | None" = None,
 ) -> Judged:
-    """Judge encoders on the held-out part of a data set.
+    """Evaluate encoders on the held-out part of a data set.
 
     Args:
         encoders: one, several, or several by names of yours: files, names of shipped ones, torch
             modules, functions.
-        data: that they are judged on.
+        data: that they are evaluated on.
         out: a folder for evaluation.json; None to write nothing.
         policy: one that does the task well: a run's folder, or a policy by name; by default the
             task's scripted policy, if it has one.
@@ -444,7 +444,7 @@ def clone(
 ) -> Agent:
     """Learn a policy from a data set alone: clone the one that acted, or improve on it.
 
-    What is learned from 80 % of the episodes is judged on the others, by its actions. Cloning keeps
+    What is learned from 80 % of the episodes is evaluated on the others, by its actions. Cloning keeps
     the epoch with the least held-out loss. Where the data's environment is here, the policy plays
     it, beside the data's own returns. The result is a run's folder, for every command that takes a
     policy. The same again resumes a training that was stopped.

@@ -103,7 +103,7 @@ def draw(studies: Sequence[Judged]) -> Figure:
     """The final return of each run and their means with 95 % intervals, a panel for each task.
 
     A marker is filled where *not worse* is supported, white where it is contradicted, else grey.
-    Dashed: the best policy that doesn't look; dotted: what has to be kept.
+    Dashed: the best blind baseline; dotted: what has to be kept.
     """
     names = representations(studies)
     figure = Figure(figsize=(PAGE, 0.7 + 0.22 * len(names)))

@@ -10,7 +10,7 @@ Whole runs show the most that one of them can say.
 Printed is Spearman's correlation in each task, and its mean over tasks with a 95 % interval over
 families of codes, and by how much that is above *rewarded* and above the short run. What was hoped
 for was written down before the first run: see PRIMARY. Then how often, of two codes, the one with
-more *rewarded* returned more; what the codes returned that should serve by the first line of
+more *rewarded* returned more; what the codes returned that are recommended by the first line of
 `jbrep evaluate`; and, for each task, what was said of every code and what its agents returned.
 """
 
@@ -53,7 +53,7 @@ class Scored(NamedTuple):
         families: of the codes, (n,).
         pairs: for each run that is left out, by what ranks the codes.
         returns: the mean final return of each code, (n,).
-        good: the codes that should serve, by their evaluation.
+        good: the recommended codes, by their evaluation.
         taken: the one to take.
     """
 
@@ -193,7 +193,7 @@ def apart(task: Scored) -> Iterator[str]:
 
 
 def advised(task: Scored) -> tuple[str, ...]:
-    """What the code to take returned, those that should serve on average, the others, the best."""
+    """What the code to take returned, the recommended on average, the others, the best."""
     returns = dict(zip(task.codes, task.returns, strict=True))
     others = [code for code in task.codes if code not in task.good]
     told = (
@@ -258,8 +258,8 @@ def main(*folders: str) -> None:
     differences.append(f"{APART[-1]:g} or more")
     title = f"Of two codes, how often that with more {REWARDED} returned more, by their difference"
     print(f"\n{Table(title, ('task', *differences), [(e.task, *apart(e)) for e in tasks]).text()}")
-    title = "Mean final returns of the code to take by jbrep evaluate, and of all that should serve"
-    header = ("task", "to take", "should serve", "the others", "best of all")
+    title = "Mean final returns of the code to take by jbrep evaluate, and of all recommended"
+    header = ("task", "to take", "recommended", "the others", "best of all")
     print(f"\n{Table(title, header, [advised(each) for each in tasks]).text()}")
     for each in tasks:
         print(f"\n{by_code(each).text()}")

@@ -1,4 +1,4 @@
-"""Judging and looking at encoders."""
+"""Evaluating and looking at encoders."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -77,13 +77,13 @@ def _tell_notes(
     evaluation: "Evaluation",
     err: bool = False,
 ) -> None:
-    """Say where encoders come from, and which may have seen what they were judged on."""
+    """Say where encoders come from, and which may have seen what they are evaluated on."""
     taken = []
     for label, source in sources.items():
         line = source if source.startswith(label) else f"{label}: {source}"
         arguments = ", ".join(encoders[label].task.given_arguments)
         taken.append(f"{line}, made with {arguments}" if arguments else line)
-    tell(f"Judged: {'; '.join(taken)}.", err)
+    tell(f"Evaluated: {'; '.join(taken)}.", err)
     if maybe := [label for label, seen in evaluation.seen.items() if seen == "maybe"]:
         tell(
             f"Perhaps not new to these episodes: {', '.join(maybe)}, whose training data has the "
