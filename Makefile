@@ -27,12 +27,10 @@ $(READY_DEMO): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dm-control,learn,view]'
 	@touch $@
 
-demo: $(READY_DEMO) ## the whole job in minutes: collect, train an encoder, learn, evaluate, report, record
+demo: $(READY_DEMO) ## the whole job in minutes: collect, train and evaluate an encoder, learn, report, record
 	rm -rf $(DEMO)
 	$(BIN)/jbrep study demo --out $(DEMO)
 	$(BIN)/jbrep data info $(DEMO)/data/face_direction
-	$(BIN)/jbrep evaluate --encoder $(DEMO)/encoders/face_direction/dae-deep-8.safetensors --data $(DEMO)/data/face_direction --out $(DEMO)/evaluation
-	$(BIN)/jbrep report $(DEMO) --evaluation $(DEMO)/evaluation
 	$(BIN)/jbrep inspect $(DEMO)/runs/face_direction/small-sac/full/seed-0 --out $(DEMO)/run.rrd
 	@echo
 	@echo "the report: $(DEMO)/report.html"

@@ -9,6 +9,8 @@ from test_study import TINY
 from jbrep.dataset import Dataset
 from jbrep.encoders import load
 from jbrep.errors import InputError
+from jbrep.evaluation.evaluation import EVALUATION, Evaluation
+from jbrep.records.document import read_document
 from jbrep.records.record import to_plain
 from jbrep.studies.config import Data, as_study
 from jbrep.studies.plan import Plan
@@ -49,6 +51,19 @@ def test_representations_are_made_from_their_own_data(made):
         assert headers["late-s1"].data["policy"]["kind"] == "mixture"
         for name, number, table in (("pca-4", 0, "apart"), ("late-s1", 1, "mixed")):
             assert Dataset(made.data(task, number, table)).fingerprint == seen[name]
+
+
+def test_encoders_are_evaluated_on_their_data_before_any_run(tmp_path, capfd):
+    study = TINY.replace(data={"steps": 100}, representations=("full", "pca-4"), evaluate=True)
+    plan = Plan(study, tmp_path / "it")
+    plan.write()
+    prepare(plan)
+    (file,) = plan.folder.rglob(EVALUATION)
+    assert file.parent == plan.folder / "evaluations" / TASK / "set-0"
+    assert {*read_document(file, Evaluation).encoders} == {"full", "pca-4"}
+    capfd.readouterr()
+    prepare(plan)
+    assert capfd.readouterr().err == ""
 
 
 @pytest.fixture

@@ -47,23 +47,6 @@ def _can_be_sent(*parts: Any) -> bool:
         return False
 
 
-class _Ahead:
-    """The pieces of a data set that are made side by side: of a shard each, in order."""
-
-    def __init__(self, growth: Growth):
-        self.waiting = deque[Any]()  # those that were begun, or what stands for them
-        self._growth, self._begin = growth, growth.episodes
-        self._each = growth.manifest.settings.shard_episodes
-
-    def next(self, most: int) -> range | None:
-        """The episodes to begin beside those that wait, most of them at a time; None if none."""
-        if self.waiting and (len(self.waiting) >= most or not self._growth.wants(self._begin)):
-            return None
-        begin, end = self._begin, (self._begin // self._each + 1) * self._each
-        self._begin = min(begin + math.ceil(self._each / _PIECES), end)
-        return range(begin, self._begin)
-
-
 def _in_processes(simulator: Simulator, workers: int) -> Produce:
     """Pieces made side by side, given in order; one whose worker is killed is made again."""
 
@@ -72,14 +55,19 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
         if not growth.wants((growth.episodes // each + 1) * each):  # one shard alone
             yield from simulator.in_turn(growth, tick)
             return
-        ahead, made = _Ahead(growth), dict[range, Made]()
+        begin, waiting, made = growth.episodes, deque[range](), dict[range, Made]()
         known = imported_modules(), spec_of(simulator.settings.task)
         close_kept()  # the workers have their own
 
         def next_piece() -> range | None:
-            if coming := ahead.next(_AHEAD * workers):
-                ahead.waiting.append(coming)
-            return coming
+            nonlocal begin
+            if waiting and (len(waiting) >= _AHEAD * workers or not growth.wants(begin)):
+                return None
+            most = (begin // each + 1) * each - begin  # a piece is of one shard
+            piece = range(begin, begin + min(math.ceil(each / _PIECES), most))
+            waiting.append(piece)
+            begin = piece.stop
+            return piece
 
         make = partial(make_episodes, known, simulator)
         with closing(side_by_side(make, next_piece, workers, _PATIENCE)) as pieces:
@@ -90,8 +78,8 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
                         f"{ATTEMPTS} times, perhaps because memory ran out: try fewer `threads`"
                     )
                 made[piece] = result
-                while ahead.waiting and ahead.waiting[0] in made:
-                    yield from _whole(made.pop(ahead.waiting.popleft()))
+                while waiting and waiting[0] in made:
+                    yield from _whole(made.pop(waiting.popleft()))
 
     return produce
 

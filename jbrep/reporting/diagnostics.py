@@ -18,6 +18,7 @@ from jbrep.evaluation.table import (
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
 from jbrep.records.tables import write_text
+from jbrep.studies.prepare import EVALUATIONS
 from jbrep.studies.record import RECORD, RunsRecord
 from jbrep.text import slug
 
@@ -44,7 +45,8 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
     """
     record = read_document(folder / RECORD, RunsRecord)
     named = record.study.evaluations if record.study else ()
-    if not (given or named or DIAGNOSTICS in record.tables):
+    own = [*(folder / EVALUATIONS).rglob(EVALUATION)]
+    if not (given or named or own or DIAGNOSTICS in record.tables):
         return []
     used = [
         Diagnosed(*key, {})
@@ -62,6 +64,8 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
             raise InputError(f"no evaluation in {pattern}: jbrep evaluate makes one")
         for file in files:
             known = evaluated(file) | known
+    for file in own:
+        known = evaluated(file) | known
     try:
         known = {_key(row): row.values for row in read_known(folder, record)} | known
     except DamageError:  # which doesn't matter if the evaluations know all

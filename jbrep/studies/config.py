@@ -183,6 +183,13 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             extra={"default": "each method's own"},
         ),
     ] = {}
+    evaluate: Annotated[
+        bool,
+        Meta(
+            description="Evaluate these encoders on their data before the first run; the report "
+            "sets it beside the returns.",
+        ),
+    ] = False
     learners: Mapping[str, Mapping[str, Any]] = {}  # the tables of algorithms, by name
     described: Mapping[str, Described] = {}  # and those of tasks
     evaluations: Annotated[

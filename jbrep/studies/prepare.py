@@ -1,7 +1,7 @@
 """The data sets and encoders that a study's runs need."""
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -11,7 +11,7 @@ from typing import Any
 from jbrep.collecting import collect
 from jbrep.collecting.collector import usual_shard_episodes
 from jbrep.collecting.policies import Policy
-from jbrep.dataset import Dataset, DataSettings
+from jbrep.dataset import Dataset, DataSettings, ScaledDataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.encoders import FULL
@@ -19,16 +19,21 @@ from jbrep.encoders.shipped import UNLEARNED, find, names
 from jbrep.envs.names import import_modules, imported_modules, is_code
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
+from jbrep.evaluation.diagnosis import write
+from jbrep.evaluation.evaluation import EVALUATION
 from jbrep.machine import cores
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method
-from jbrep.play.sources import find_policy
+from jbrep.play.sources import find_good_policy, find_policy
 from jbrep.pool import ATTEMPTS, side_by_side
 from jbrep.records.storage import exists
 from jbrep.rl import Run
 from jbrep.studies.config import Data, data_key
 from jbrep.studies.plan import Plan
 from jbrep.studies.representations import ByName
+from jbrep.text import slug
+
+EVALUATIONS = "evaluations"  # the folder of those that a study makes
 
 
 def check(plan: Plan) -> None:
@@ -205,6 +210,21 @@ class Made:
             if fitter.fit(kind, name=name, **given).is_new:
                 say(f"{self}: encoder {name}")
 
+    def evaluate(self) -> None:
+        """Evaluate its encoders on it, where that wasn't done."""
+        fitter, out = self.fitter(), self.plan.folder / EVALUATIONS / slug(self.task)
+        files = {
+            name: fitter.plan(kind, name=name, **given).path
+            for name, kind, given in self.fits()
+            if name != FULL
+        }
+        out = out / self.name / f"set-{self.number}"
+        if files and not exists(out / EVALUATION):
+            data = ScaledDataset.of(self.folder)
+            policy = find_good_policy(None, data.task, bool(data.dataset.manifest.settings.reward))
+            write(files, data, out, policy)
+            say(f"{self}: its encoders are evaluated in {out}")
+
 
 def every_made(plan: Plan) -> list[Made]:
     """All data sets of a study."""
@@ -235,7 +255,7 @@ def say(line: str) -> None:
 
 
 def prepare(plan: Plan, workers: int = 1) -> None:
-    """Collect the data sets and train the encoders that don't exist yet.
+    """Collect the data sets and train the encoders that don't exist yet; evaluate these if asked.
 
     What is made doesn't depend on how many workers make it. Stopped, it goes on where it was.
 
@@ -243,7 +263,12 @@ def prepare(plan: Plan, workers: int = 1) -> None:
         plan: the study.
         workers: how many processes go on at a time.
     """
-    waiting = [each for each in every_made(plan) if not each.is_made]
+    _make_all([each for each in every_made(plan) if not each.is_made], workers)
+    for each in every_made(plan) if plan.study.evaluate else ():
+        each.evaluate()
+
+
+def _make_all(waiting: Sequence[Made], workers: int) -> None:
     workers = min(workers, cores(), len(waiting))
     if workers < 2:
         for each in waiting:

@@ -29,12 +29,20 @@ from jbrep.studies.plan import (
     find_committed,
     registration_in,
 )
-from jbrep.studies.prepare import check, policies, prepare, say
+from jbrep.studies.prepare import EVALUATIONS, check, policies, prepare, say
 from jbrep.studies.tables import REFERENCE_RETURNS, play_references, write_tables
 
 ERROR = "error.txt"  # the traceback of a run that crashed
 CRASHED = "crashed"
-_OWN = STUDY, REGISTRATION, REFERENCE_RETURNS, "data", "encoders", "runs"  # see `make_folder`
+_OWN = (
+    STUDY,
+    REGISTRATION,
+    REFERENCE_RETURNS,
+    "data",
+    "encoders",
+    EVALUATIONS,
+    "runs",
+)  # see `make_folder`
 _PATIENCE = 60.0  # seconds, until runs have written their checkpoints
 _WRITE_EVERY = 1.0  # seconds
 _TELL_EVERY = 30.0  # seconds
