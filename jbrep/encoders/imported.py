@@ -39,7 +39,9 @@ class Model:
         with refusing("it isn't an ONNX model", told=first_line):
             self.proto = onnx.load_model_from_string(content)
             self._content = content
-            _check_alone(self.proto)
+            for each in _messages(self.proto):
+                if isinstance(each, TensorProto) and each.data_location == TensorProto.EXTERNAL:
+                    raise InputError(f"the tensor {each.name} is in another file")
             ends = (*self.proto.graph.input, *self.proto.graph.output)
             given, made = (each.type.tensor_type for each in ends)
             self.inputs, self.units = (each.shape.dim[1].dim_value for each in (given, made))
@@ -154,12 +156,6 @@ def _layer(said: str, model: ModelProto, size: int) -> Model:
 
 def _shape(width: int) -> onnx.TensorShapeProto:
     return helper.make_tensor_type_proto(TensorProto.FLOAT, ("rows", width)).tensor_type.shape
-
-
-def _check_alone(model: ModelProto) -> None:
-    for each in _messages(model):
-        if isinstance(each, TensorProto) and each.data_location == TensorProto.EXTERNAL:
-            raise InputError(f"the tensor {each.name} is in another file")
 
 
 def _messages(message: Message) -> Iterator[Message]:

@@ -16,7 +16,7 @@ from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.encoders import FULL
 from jbrep.encoders.shipped import UNLEARNED, find, names
-from jbrep.envs.names import import_modules, imported_modules, is_code
+from jbrep.envs.names import INSTANCE, import_modules, imported_modules, is_code
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.evaluation.diagnosis import write
@@ -47,6 +47,8 @@ def check(plan: Plan) -> None:
             each.to_collect()
     for name in plan.study.tasks:
         task = plan.task(name)
+        if task.id.startswith(INSTANCE):
+            raise InputError(f"{task.id} is in this process alone, runs aren't: give its class")
         for representation in by_name(plan):
             _check_by_name(plan, representation, task)
     _check_own(plan)
