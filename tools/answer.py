@@ -20,12 +20,13 @@ from jbrep.records.storage import write_whole
 from jbrep.reporting.figures.panels import PAGE, Look, Plot, reference, styles
 from jbrep.reporting.findings import Agents, Findings, Group
 from jbrep.reporting.tables import read_tables
-from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, SUPPORTED
+from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, SUPPORTED, UNDECIDED
 from jbrep.text import interval
 
 ORDER = ("coordinates", "symmetry")  # first; the others as their names are
 INSIDE = {CONTRADICTED: "white", SUPPORTED: None}  # of a mean's marker; None as the rest of it
 OPEN = "lightgrey"  # where nothing is decided
+MARKS = {SUPPORTED: "🟩", CONTRADICTED: "🟥", UNDECIDED: "⬜"}
 
 
 class Verdict(NamedTuple):
@@ -94,9 +95,8 @@ def _cell(study: Judged, name: str) -> str:
     if name not in study.verdicts:
         return returned
     verdict = study.verdicts[name]
-    if np.isnan(verdict.share):
-        return f"{returned}, {verdict.verdict}"
-    return f"{returned}, {verdict.share:.2f}, {verdict.verdict}"
+    share = "" if np.isnan(verdict.share) else f", {verdict.share:.2f}"
+    return f"{returned}{share} {MARKS[verdict.verdict]}"
 
 
 def draw(studies: Sequence[Judged]) -> Figure:
