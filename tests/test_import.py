@@ -117,7 +117,7 @@ def test_a_list_of_episodes_gives_the_same(written, tmp_path):
 def test_without_the_final_observation_the_last_step_is_left_out(tmp_path):
     given = arrays()
     del given["final_observations"]
-    with pytest.warns(Notice, match="the last step of 2 episodes of arrays is left out"):
+    with pytest.warns(Notice, match="3 rows at the end of an episode"):
         dataset = from_arrays(tmp_path / "data", **given)
     assert dataset.episodes["length"].tolist() == [6, 11]  # nothing is left of the one of a step
     np.testing.assert_array_equal(

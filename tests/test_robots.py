@@ -23,9 +23,9 @@ def learning(monkeypatch):
 def robots(monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
     monkeypatch.chdir(FOLDER)
-    import robots
+    import mybots
 
-    return robots
+    return mybots
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_what_is_found_of_a_robot_and_what_its_command_needs(
     assert kinds == found
     assert made.advice.representation == recommended
     given = made.advice.command.split()
-    assert {"--import=robots", *options} <= {*given}
+    assert {"--import=mybots", *options} <= {*given}
     if not options:
         assert not [each for each in given if each.startswith(("--action", "--episode"))]
 

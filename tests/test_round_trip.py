@@ -35,7 +35,7 @@ def trip(tmp_path_factory):
         *("--episode-steps", STEPS, "--out", folder / "log"),
     )
     assert told.exit_code == 0, told.output
-    assert f"{EPISODES} rows after the last action of an episode, or alone" in told.output
+    assert f"{EPISODES} rows at the end of an episode, which has no next state" in told.output
     steps = EPISODES * STEPS
     return (
         returns,

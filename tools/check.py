@@ -1,4 +1,4 @@
-"""Check well-made robots and print the table of docs/checking.md: python tools/check.py."""
+"""Check well-made robots and print the table of docs/check.md: python tools/check.py."""
 
 import argparse
 import sys
@@ -21,7 +21,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=44_000)
     given = parser.parse_args()
     sys.path.insert(0, str(ROOT / "examples/robots"))
-    import robots  # type: ignore[import-not-found]  # noqa: F401  # it registers the last two
+    import mybots  # type: ignore[import-not-found]  # noqa: F401  # it registers the last two
 
     print("| task | found | begin with |\n|---|---|---|", flush=True)
     for robot in given.robots:

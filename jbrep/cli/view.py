@@ -56,8 +56,8 @@ def inspect(
     from jbrep.inspection import inspect as record  # imports torch
 
     path = record(source, episode, task, encoder, traverse, out, say)
+    say("the robot, its signals over time, an encoder's latent, and its settings (provenance):")
     say(f"rerun {quote(str(path))}")
-    say("shows the robot, its signals over time, and an encoder's latent; settings: provenance")
     if view:
         _run_viewer(path)
 

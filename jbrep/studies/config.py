@@ -184,12 +184,12 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         ),
     ] = {}
     evaluate: Annotated[
-        bool,
+        bool | UnsetType,
         Meta(
             description="Evaluate these encoders on their data before the first run; the report "
             "sets it beside the returns.",
         ),
-    ] = False
+    ] = UNSET
     learners: Mapping[str, Mapping[str, Any]] = {}  # the tables of algorithms, by name
     described: Mapping[str, Described] = {}  # and those of tasks
     evaluations: Annotated[

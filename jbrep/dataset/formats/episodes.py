@@ -34,7 +34,6 @@ class Incoming(NamedTuple):
     terminated: bool
     truncated: bool  # also where it was terminated; else it counts as truncated anyway
     seed: int
-    is_cut: bool = False  # whether its last step was left out, for want of a final observation
     missing: int = 0  # numbers in whose place are others, or at which it was divided
 
 
@@ -162,7 +161,6 @@ def episode_of(where: str, rows: Rows, once: Mapping[str, Any]) -> Incoming | No
         terminated=bool(ended.get("terminated", False)) and final is not None,
         truncated=bool(ended.get("truncated", False)),
         seed=seed,
-        is_cut=final is None,
     )
 
 

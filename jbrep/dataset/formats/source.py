@@ -35,7 +35,7 @@ Array = NDArray[Any]
 _SIGNALS = ("observation", "action", "reward")
 _EXACT = ("time", "episode")  # of which no digit may be lost
 _ALIKE = ("task", "features", "has_rewards", "action_bounds", "subtracted")  # of several sources
-_LAST = ("row", "at the end of an episode, which has no next state: dropped")
+LAST = ("row", "at the end of an episode, which has no next state: dropped")
 
 
 class Source:
@@ -117,7 +117,7 @@ class Source:
             for i, part in enumerate(parts):
                 once = (seed if i == 0 else {}) | (ends if i == len(parts) - 1 else {})
                 episode = episode_of(where, part, once)
-                self._counts[_LAST] += len(part["action"]) - (len(episode.action) if episode else 0)
+                self._counts[LAST] += len(part["action"]) - (len(episode.action) if episode else 0)
                 if episode:
                     self._turns.see(episode.observation)
                     yield episode

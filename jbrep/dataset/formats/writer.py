@@ -16,7 +16,7 @@ from jbrep.dataset.formats.arrays import frame_in_python
 from jbrep.dataset.formats.clock import same_clock
 from jbrep.dataset.formats.episodes import Incoming, count_missing, single, without_missing
 from jbrep.dataset.formats.frame import frame_of_table
-from jbrep.dataset.formats.source import Source
+from jbrep.dataset.formats.source import LAST, Source
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.manifest import (
     Manifest,
@@ -84,7 +84,11 @@ def from_arrays(
     columns = {"observation": observations, "action": actions, "reward": rewards}
     columns |= {"terminated": terminations, "truncated": truncations}
     once = {"final_observation": final_observations, "seed": seeds}
-    return _written(folder, Source(frame_in_python(columns, once, source)), task)
+    opened = Source(frame_in_python(columns, once, source))
+    made = _written(folder, opened, task)
+    if lost := opened.changes()[LAST]:
+        warnings.warn(f"{counted(lost, LAST[0])} {LAST[1]}", Notice, 2)
+    return made
 
 
 def from_table(
@@ -216,7 +220,7 @@ def _survey(source: Source, missing: str) -> _Survey:
     low, high = np.array(np.inf), np.array(-np.inf)
     with Progress(total=source.rows, unit="step", unit_scale=True, desc="read") as progress:
         for whole in source.episodes():
-            counts.update(missing=count_missing(whole), left=len(whole.action), cut=whole.is_cut)
+            counts.update(missing=count_missing(whole), left=len(whole.action))
             for episode in without_missing(whole, missing):
                 seen = Signals.of(episode.observation)
                 signals = signals.joined(seen) if signals else seen
@@ -229,9 +233,6 @@ def _survey(source: Source, missing: str) -> _Survey:
         told = f"{source.name} had {counted(counts['missing'], 'missing reading')} ({missing})"
         told += f": {counted(counts['left'], 'step')} left out" if counts["left"] else ""
         warnings.warn(told, Notice, 2)
-    if counts["cut"] and not source.changes():  # which say so
-        told = f"the last step of {counted(counts['cut'], 'episode')} of {source.name} is left out"
-        warnings.warn(f"{told}: what was observed after it isn't known", Notice, 2)
     if signals is None:
         done = "".join(f"; {counted(n, what)} {how}" for (what, how), n in source.changes().items())
         raise InputError(
