@@ -132,15 +132,15 @@ def check(
     write: Path | None = None,
     out: Path | None = None,
 ) -> "Check":
-    """Say what to change of a robot before anything learns, worst first.
+    """List what to fix in an environment before training, worst first.
 
     TASK is played for about a minute by simple policies: standing still, constant actions, random
-    ones, held and coloured ones. Or `data` are read. Each finding has its evidence and what mends
-    it; at the end stands the representation to begin with.
+    ones, held and coloured ones. Or `data` are read instead. Each finding has its evidence and its
+    fix; the end recommends a representation.
 
     Args:
         data: a data set, or its folder, in place of a task.
-        steps: to play in all, or to read; of each policy at least four episodes are played.
+        steps: total steps to play or read; of each policy at least four episodes are played.
         seed: of episodes and of what is held out: the same one finds the same.
         write: a new features file, with names, units, ranges and kinds as found.
         out: a page with pictures for a browser, a new file.
@@ -184,10 +184,9 @@ def collect(
 ) -> "Dataset":
     """Collect the states that a policy visits.
 
-    The same again resumes an unfinished data set and leaves a finished one as it is; with more
-    `steps` it extends it, to the data that as many at once give. The number of environments or
-    threads doesn't change the data. A robot that exists once needs `threads` 1. Whole
-    shards are kept whatever happens. The policy of a run is kept with the data as it is at the
+    Repeat it to resume. A finished data set stays as it is; with more `steps` it is extended, to
+    the same data as if it had been made at once. The number of environments or threads doesn't
+    change the data. A robot that exists once needs `threads` 1. Whole shards are always kept. The policy of a run is kept with the data as it is at the
     start, also if the run goes on.
 
     Args:
@@ -371,14 +370,14 @@ def train(
     """Train and evaluate one agent.
 
     It sees the full observation, scaled, or an encoder's latent. A checkpoint is written every
-    minute, and on Ctrl-C before the command ends (td3 takes seconds to get there). The same again
-    resumes from it, to the same result. The last one stays: with more `steps` the same goes on from
-    there, to the result that it would have had with as many from the start.
+    minute, and on Ctrl-C before the command ends (td3 takes seconds to get there). Repeat it to
+    resume, to the same result. The last checkpoint stays: with more `steps` training continues, to
+    the result of one run of that length.
 
     Args:
         task: that it learns.
         out: a folder for this run.
-        seed: of agent and episodes.
+        seed: of the agent and the episodes.
         threads: of a batch, as many as cores by default. 1 is one instance of another environment,
             as of a robot that exists once: num_envs is 1, in the preset modern unless one is named,
             and evaluations wait for the end of an episode.

@@ -61,8 +61,7 @@ TaskName = Annotated[
 Hide = Annotated[
     Sequence[str],
     Meta(
-        description="A feature or group that isn't seen, or a pattern: 'velocity_*'; may be "
-        "repeated.",
+        description="A feature or group to remove, or a pattern, 'velocity_*'; may be repeated.",
         extra={"metavar": "NAME"},
     ),
 ]
@@ -102,8 +101,8 @@ Normalize = Annotated[
 Seen = Annotated[
     Any,
     Meta(
-        description="What it sees: an encoder's file, a shipped encoder's name, or code as "
-        "module:Class, which is run; full is the whole observation, scaled alike.",
+        description="What it observes: full, the scaled observation; coordinates, symmetry or another "
+        "that ships; an encoder's file; or code as module:Class, which is run.",
         extra={"is_code": True},
     ),
 ]
@@ -128,7 +127,7 @@ def described(
         env: an argument of the environment, such as g=1.6; may be repeated.
         episode_steps: the time limit of an episode; the environment's own by default.
         features: a TOML file with names, units, ranges, kinds and offsets of the features.
-        missing: what becomes of readings that aren't finite: an episode ends before one, or the
+        missing: how to treat NaN and infinite readings: an episode ends before one, or the
             last one is held for at most N steps; otherwise they are errors.
         action_bounds: of each number of an action, or of all, such as -1..1; they must be given
             where the environment has none.

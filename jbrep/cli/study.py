@@ -37,8 +37,8 @@ def study(
 
     STUDY is a TOML file of tasks, algorithms, representations and seeds, or demo, which ships.
     Tasks are the Jitterbug's, by their names, and any environments, by their Gymnasium ids.
-    One with claims is registered first, in a commit; then data sets and encoders are made. Stopped
-    or killed, the same command resumes the study; runs that have ended are never run again.
+    One with claims must be registered first: run --register, and commit the file that it writes.
+    Stopped or killed, the same command resumes the study; runs that have ended are kept.
 
     Args:
         out: a folder; by default runs/NAME of the STUDY.

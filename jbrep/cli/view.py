@@ -41,7 +41,7 @@ def inspect(
     Args:
         episode: its number, from 0; 0 if not given.
         encoder: a file, a name that ships, or code, mymodule:MyEncoder; a run's own if not given.
-        traverse: show what each unit of the latent moves.
+        traverse: vary each unit of the latent, and show what is decoded.
         out: an .rrd file; one in inspect/ if not given.
         view: open it in the Rerun viewer.
     """

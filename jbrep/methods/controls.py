@@ -73,7 +73,7 @@ class Subset(ClosedForm, frozen=True, kw_only=True):
 
 
 class Noise(Coded, ClosedForm, frozen=True, kw_only=True):
-    """The scaled observation, padded to l units with noise.
+    """The scaled observation, padded to l units with fast sines of it.
 
     All features pass around the layers; each unit beside them is the sine of a fast phase. An
     encoder draws nothing, so that the noise is of the observation itself: sin(W x + b), with W of

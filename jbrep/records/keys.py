@@ -28,7 +28,7 @@ class Key(NamedTuple):
     def default_shown(self) -> str:
         """The default for a reader; empty where there is none, or it says nothing.
 
-        An annotation says what it stands for by `Meta(extra={"default": "ten times as many"})`.
+        An annotation says what it stands for by `Meta(extra={"default": "each task's own"})`.
         """
         value, words = self.default, str(self.extra.get("default", ""))
         if words or value in (NODEFAULT, UNSET, None, ""):

@@ -99,12 +99,12 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
             ge=0,
             le=MAX_EPISODES,
             description="Episodes of the last evaluation, after training.",
-            extra={"default": "ten times as many"},
+            extra={"default": "10 x evaluation_episodes"},
         ),
     ] = 0
     device: Annotated[
         Literal["cpu", "cuda", "auto"],
-        Meta(description="Of gradient steps; auto is cuda where there is one."),
+        Meta(description="Device for gradient steps; auto is cuda where there is one."),
     ] = "cpu"
 
     def check(self) -> None:

@@ -24,7 +24,7 @@ On = Annotated[
 ]
 LeaveOut = Annotated[
     tuple[Ingredient, ...],
-    Meta(description=f"Ingredients that coordinates have not: {', '.join(INGREDIENTS)}."),
+    Meta(description=f"Parts of coordinates to leave out: {', '.join(INGREDIENTS)}."),
 ]
 Clip = Annotated[
     Annotated[float, Meta(ge=1, le=10**6)] | None,
@@ -38,7 +38,7 @@ Keep = Annotated[
 Codes = Annotated[
     Literal["raw", "standard", "white"],
     Meta(
-        description="Scale of the code: raw, as the method gives it; standard, mean 0 and standard "
+        description="Scale of the latent: raw, as the kind gives it; standard, mean 0 and standard "
         "deviation 1/3 of each unit; or white, uncorrelated as well."
     ),
 ]
