@@ -186,8 +186,8 @@ def collect(
 
     Repeat it to resume. A finished data set stays as it is; with more `steps` it is extended, to
     the same data as if it had been made at once. The number of environments or threads doesn't
-    change the data. A robot that exists once needs `threads` 1. Whole shards are always kept. The policy of a run is kept with the data as it is at the
-    start, also if the run goes on.
+    change the data. A robot that exists once needs `threads` 1. Whole shards are always kept. The
+    policy of a run is kept with the data as it is at the start, also if the run goes on.
 
     Args:
         task: whose environment is played; how readings that are missing are treated belongs to it.
