@@ -53,7 +53,7 @@ check: docs ## lint, types, import direction, links of the documentation
 	$(BIN)/mypy benchmarks/*.py
 	$(BIN)/lint-imports
 
-bench: $(READY) ## speed as ratios in one run, and what the hand-written policies return
+bench: $(READY) ## speed as ratios in one run, and what the scripted policies return
 	for each in quick throughput dataset encoders methods learning inspection heuristics environments; do \
 	  MUJOCO_GL=disable KINETO_LOG_LEVEL=10 $(BIN)/python benchmarks/$$each.py || exit; \
 	done
@@ -82,7 +82,7 @@ data: $(READY) ## data sets of five million states in data/, and one million of 
 encoders: data ## results/encoders/ from these: hours; goes on where it was stopped
 	$(BIN)/python tools/encoders.py data encoders results/encoders $(TASKS) cheetah
 
-decoded: $(READY) ## results/decoded.txt anew: hand-written policies on what encoders give back
+decoded: $(READY) ## results/decoded.txt anew: scripted policies on what encoders give back
 	for task in $(TASKS); do \
 	  $(BIN)/jbrep evaluate-policy heuristic --task $$task || exit; \
 	  for name in dae pca random linear-forward forward; do for latent in 12 8 4; do \

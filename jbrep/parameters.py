@@ -101,7 +101,7 @@ Normalize = Annotated[
 Seen = Annotated[
     Any,
     Meta(
-        description="What it observes: full, the scaled observation; coordinates, symmetry, another "
+        description="What it observes: full, the scaled observation; coordinates, symmetry, one "
         "that ships; an encoder's file; or code as module:Class, which is run.",
         extra={"is_code": True},
     ),

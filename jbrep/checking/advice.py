@@ -1,7 +1,10 @@
 """The representation to begin with, and the features file that says what was found."""
 
 import shlex
+import warnings
 from collections.abc import Sequence
+from contextlib import suppress
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +22,8 @@ from jbrep.envs.view import with_view
 from jbrep.errors import InputError
 from jbrep.records.document import toml_text
 
+# what a features file says
+_told = attrgetter("features", "offsets", "timestep", "reward_low", "reward_high", "solved_return")
 _USUAL = 0.01, 0.99  # quantiles of what was seen: a usual range, where none is known
 
 
@@ -44,14 +49,10 @@ def advise(
     Their file stands `where`, `data` is the folder that was read.
     """
     task, features = seen.task, _found(seen, shapes)
-    bounds = tuple(zip(task.action_low, task.action_high, strict=True))
-    own = task.whole if data else _own(task, bounds)
-    kinds = [
-        [(each.name, each.kind, each.frame) for each in some]
-        for some in (features, task.whole.features, own.features)
-    ]
+    own = task.whole if data else _own(task) or _own(task, _bounds(task)) or task.whole
+    kinds = [[(e.name, e.kind, e.frame) for e in some] for some in (features, task.whole.features)]
     scales = any(each.kind == "scales" for each in findings)
-    use_file = bool(where or kinds[0] != kinds[1] or kinds[1] != kinds[2] or scales)
+    use_file = bool(where or kinds[0] != kinds[1] or _told(task.whole) != _told(own) or scales)
     known = task.whole.replace(features=features) if use_file else task.whole
     hidden = [*(task.view.hidden if task.view else ())]
     for each in findings:
@@ -84,21 +85,22 @@ def _given(task: Task) -> list[str]:
     made += [f"--env={each}" for each in task.given_arguments]
     if spec_of(task).max_episode_steps != task.max_episode_steps:
         made.append(f"--episode-steps={task.max_episode_steps}")
-    low, high = task.action_low, task.action_high
-    try:
-        own = _own(task, ())
-        is_own = (own.action_low, own.action_high) == (low, high)
-    except InputError:  # it has none
-        is_own = False
-    if not is_own:
-        bounds = [f"{a:g}..{b:g}" for a, b in zip(low, high, strict=True)]
+    own = _own(task)
+    if own is None or _bounds(own) != _bounds(task):
+        bounds = [f"{a:.9g}..{b:.9g}" for a, b in _bounds(task)]
         made.append(f"--action-bounds={','.join(bounds if len({*bounds}) > 1 else bounds[:1])}")
     return made + [f"--missing={task.missing}"] * bool(task.missing)
 
 
-def _own(task: Task, bounds: Bounds) -> Task:
-    """The task as its environment describes itself."""
-    return describe(task.id, task.arguments, task.max_episode_steps, action_bounds=bounds)
+def _own(task: Task, bounds: Bounds = ()) -> Task | None:
+    """The task as its environment describes itself; None where that can't be a task."""
+    with suppress(InputError), warnings.catch_warnings(action="ignore"):
+        return describe(task.id, task.arguments, task.max_episode_steps, action_bounds=bounds)
+    return None
+
+
+def _bounds(task: Task) -> Bounds:
+    return tuple(zip(task.action_low, task.action_high, strict=True))
 
 
 def _system(task: Task, winds: bool) -> tuple[str, str]:

@@ -158,7 +158,7 @@ def _wraps(seen: Seen, i: int, turn: Turn) -> Finding:
 
 def _winds(seen: Seen, i: int) -> Finding | None:
     feature, low, high = seen.task.features[i], seen.before[:, i].min(), seen.before[:, i].max()
-    if not feature.is_angle or high - low <= 2 * np.pi:
+    if not feature.is_angle or high - low <= 2 * np.pi * (1 + _ROOM):
         return None
     why = f"goes from {low:.3g} to {high:.3g} rad: one pose has several values"
     return Finding("winds", (feature.name,), why, "--encoder coordinates: cosine and sine don't")

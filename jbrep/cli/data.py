@@ -37,8 +37,11 @@ def env(task: str, /, *, as_json: AsJson = False, **options: Annotated[Any, desc
 @command("check Hopper-v5 --write features.toml")
 def _check(as_json: AsJson = False, **options: Annotated[Any, api.check]) -> None:
     found = api.check(options.pop("task", None), **options)
-    if (given := click.get_current_context().params.get("features")) and not options.get("write"):
-        command = found.advice.command.replace("features.toml", shlex.quote(str(given)))
+    file = click.get_current_context().params.get("features")
+    kinds = [[e.kind for e in t] for t in (found.advice.features, found.seen.task.whole.features)]
+    if file and not options.get("write") and kinds[0] == kinds[1]:
+        word = shlex.quote(f"--features={file}")
+        command = found.advice.command.replace("--features=features.toml", word)
         found = found._replace(advice=found.advice._replace(command=command))
     say_json(found.plain()) if as_json else say(found.text(terminal_width()))
     for what, path in (("features file", options.get("write")), ("page", options.get("out"))):

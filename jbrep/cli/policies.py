@@ -10,15 +10,7 @@ from msgspec import Meta
 from jbrep.cli.base import command, say, say_json, tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
-from jbrep.parameters import (
-    AsJson,
-    Episodes,
-    NewFile,
-    Retries,
-    TaskName,
-    Threads,
-    described,
-)
+from jbrep.parameters import AsJson, Episodes, NewFile, Retries, TaskName, Threads, described
 from jbrep.records.record import to_plain
 from jbrep.text import counted, interval_of, percentiles, table, terminal_width
 

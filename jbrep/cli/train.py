@@ -66,7 +66,7 @@ class _Making(Command):
             return [record for each in options if (record := each.get_help_record(ctx))]
 
         methods, settings = self._methods, self._settings
-        if kind := ctx.meta.get("kind"):
+        if (kind := ctx.meta.get("kind")) in methods:
             methods = {kind: methods[kind]}
             settings = self._settings_of(methods)
         sections = {

@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 
 from jbrep.collecting.shards import NUM_ENVS
 from jbrep.dataset import Dataset, DataSettings, Episode
-from jbrep.dataset.manifest import (
-    Manifest,
-)
+from jbrep.dataset.manifest import Manifest
 from jbrep.envs.environments import Environments
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Read, Recording, Tick, open_loop, read_nothing, read_states, record

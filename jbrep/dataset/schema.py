@@ -9,13 +9,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
-from jbrep.dataset.settings import (
-    IMPORTED,
-    MAX_LETTERS,
-    MIXTURE,
-    CollectSettings,
-    PolicySettings,
-)
+from jbrep.dataset.settings import IMPORTED, MAX_LETTERS, MIXTURE, CollectSettings, PolicySettings
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import pattern, to_plain

@@ -45,7 +45,7 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
     """
     record = read_document(folder / RECORD, RunsRecord)
     named = record.study.evaluations if record.study else ()
-    own = [*(folder / EVALUATIONS).rglob(EVALUATION)]
+    own = sorted((folder / EVALUATIONS).rglob(EVALUATION))
     if not (given or named or own or DIAGNOSTICS in record.tables):
         return []
     used = [

@@ -28,12 +28,7 @@ from jbrep.records.container import Tensors, without
 from jbrep.records.document import Document, document_from
 from jbrep.records.record import Version
 from jbrep.records.storage import exists
-from jbrep.rl.agent import (
-    ColouredActionNoise,
-    parameters,
-    restore_statistics,
-    statistics_of,
-)
+from jbrep.rl.agent import ColouredActionNoise, parameters, restore_statistics, statistics_of
 from jbrep.rl.files import CHECKPOINT, FAILED, RUN, Episode, Evaluation, Info, RunRecord, read_run
 from jbrep.rl.history import History
 from jbrep.rl.run_settings import RunSettings

@@ -40,13 +40,7 @@ from jbrep.rl.agent import (
     training_seed,
     unchecked_distributions,
 )
-from jbrep.rl.checkpoint import (
-    Checkpoint,
-    Saver,
-    Standing,
-    standing,
-    vec_env,
-)
+from jbrep.rl.checkpoint import Checkpoint, Saver, Standing, standing, vec_env
 from jbrep.rl.files import (
     BEGINNING,
     CHECKPOINT,

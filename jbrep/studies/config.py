@@ -262,8 +262,9 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
 
     def _check_data(self) -> None:
         """Check where data come from, and that the study can make its encoders of them."""
-        if self.training and not self.data:
-            raise InputError("training is for encoders made by the study: [data] is missing")
+        if (self.training or self.evaluate) and not self.data:
+            key = "training" if self.training else "evaluate"
+            raise InputError(f"{key} is for encoders made by the study: [data] is missing")
         unused = {*self.named_data}
         for given, representation in zip(self.representations, self.observed, strict=True):
             if not isinstance(representation, ByName):
@@ -413,8 +414,8 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             first = learns_from(learner.algorithm, learner.hyperparameters.within(self.steps))
             if self.steps <= first:
                 lines.append(
-                    f"{learner.name} learns from step {first:,} on: {self.steps:,} steps leave its "
-                    "policies as they were drawn."
+                    f"{learner.name} learns from step {first:,} on: nothing is learned in "
+                    f"{self.steps:,} steps."
                 )
         return lines
 

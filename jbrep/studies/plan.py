@@ -38,6 +38,7 @@ _GRID = (  # may change
     "algorithms",
     "representations",
     "seeds",
+    "evaluate",
     "evaluations",
     "title",
 )

@@ -20,12 +20,13 @@ from jbrep.envs.names import INSTANCE, import_modules, imported_modules, is_code
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.evaluation.diagnosis import write
-from jbrep.evaluation.evaluation import EVALUATION
+from jbrep.evaluation.evaluation import EVALUATION, Evaluation
 from jbrep.machine import cores
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method
 from jbrep.play.sources import find_good_policy, find_policy
 from jbrep.pool import ATTEMPTS, side_by_side
+from jbrep.records.document import read_document
 from jbrep.records.storage import exists
 from jbrep.rl import Run
 from jbrep.studies.config import Data, data_key
@@ -214,18 +215,17 @@ class Made:
 
     def evaluate(self) -> None:
         """Evaluate its encoders on it, where that wasn't done."""
-        fitter, out = self.fitter(), self.plan.folder / EVALUATIONS / slug(self.task)
-        files = {
-            name: fitter.plan(kind, name=name, **given).path
-            for name, kind, given in self.fits()
-            if name != FULL
-        }
-        out = out / self.name / f"set-{self.number}"
-        if files and not exists(out / EVALUATION):
+        fitter, place = self.fitter(), (slug(self.task), self.name, f"set-{self.number}")
+        path = self.plan.folder.joinpath(EVALUATIONS, *place, EVALUATION)
+        files = {n: fitter.plan(kind, name=n, **given).path for n, kind, given in self.fits()}
+        files.pop(FULL, None)
+        known = read_document(path, Evaluation).encoders if exists(path) else {}
+        if files.keys() - known.keys():
+            path.unlink(missing_ok=True)  # encoders may have been added
             data = ScaledDataset.of(self.folder)
             policy = find_good_policy(None, data.task, bool(data.dataset.manifest.settings.reward))
-            write(files, data, out, policy)
-            say(f"{self}: its encoders are evaluated in {out}")
+            write(files, data, path.parent, policy)
+            say(f"{self}: its encoders are evaluated in {path.parent}")
 
 
 def every_made(plan: Plan) -> list[Made]:

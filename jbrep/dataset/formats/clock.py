@@ -98,7 +98,7 @@ def _resampled(
     counts["row", f"at {rate:g} Hz, {how}"] += count
     silent = f"dropped, as a column was silent for more than {layout.gap} s"
     counts["row", silent] += int((~whole).sum())
-    held = "of these with a reading older than two of its usual intervals, up to --gap"
+    held = "kept with a reading older than two of its usual intervals"
     counts["row", held] += int((whole & np.any(old, axis=0)).sum())
     for first, end in stretches(whole):
         some = even[first:end]

@@ -35,14 +35,7 @@ from jbrep.envs.probe import features_of
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line, listed, refusing
 from jbrep.progress import Progress
-from jbrep.records.storage import (
-    check_space,
-    exists,
-    make_folder,
-    publish,
-    unfinished,
-    write_whole,
-)
+from jbrep.records.storage import check_space, exists, make_folder, publish, unfinished, write_whole
 
 Array = NDArray[Any]
 

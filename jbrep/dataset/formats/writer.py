@@ -18,13 +18,7 @@ from jbrep.dataset.formats.episodes import Incoming, count_missing, single, with
 from jbrep.dataset.formats.frame import frame_of_table
 from jbrep.dataset.formats.source import LAST, Source
 from jbrep.dataset.layout import Layout
-from jbrep.dataset.manifest import (
-    Manifest,
-    commit,
-    new_manifest,
-    range_problems,
-    write_manifest,
-)
+from jbrep.dataset.manifest import Manifest, commit, new_manifest, range_problems, write_manifest
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.rewards import reward_function, without_range
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
