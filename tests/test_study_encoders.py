@@ -199,6 +199,15 @@ def test_a_study_names_evaluations(done, tmp_path):
     assert [row.representation for row in read_diagnostics(tmp_path / DIAGNOSTICS)] == ["full"]
 
 
+def test_evaluations_that_a_study_makes_are_found(done, tmp_path):
+    forge(tmp_path / RECORD, json.loads((done.folder / RECORD).read_text()))
+    assert add_diagnostics(tmp_path) == []
+    (tmp_path / "evaluations").mkdir()
+    write_evaluation(tmp_path / "evaluations" / TASK, {"full": (None, 0.75)})
+    add_diagnostics(tmp_path)
+    assert [row.representation for row in read_diagnostics(tmp_path / DIAGNOSTICS)] == ["full"]
+
+
 def test_the_report_tells_of_own_encoders(done):
     found = Findings.of(read_tables(done.folder))
     assert found.own_encoders == ["mine"]

@@ -28,7 +28,9 @@ def main() -> None:
     listed = subprocess.run(["git", "ls-files"], capture_output=True, text=True, check=True)
     counts = Counter[str]()
     for name in listed.stdout.split():
-        if name.endswith((".py", ".md", ".j2", ".toml")) and not name.startswith(ELSEWHERE):
+        if name.endswith((".py", ".md", ".j2", ".toml", "Makefile")) and not name.startswith(
+            ELSEWHERE
+        ):
             text = Path(name).read_text()
             for word in WORDS:
                 counts[word] += len(re.findall(rf"\b{word}\b", text, re.IGNORECASE))
