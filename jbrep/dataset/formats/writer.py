@@ -78,9 +78,9 @@ def from_arrays(
     columns = {"observation": observations, "action": actions, "reward": rewards}
     columns |= {"terminated": terminations, "truncated": truncations}
     once = {"final_observation": final_observations, "seed": seeds}
-    opened = Source(frame_in_python(columns, once, source))
-    made = _written(folder, opened, task)
-    if lost := opened.changes()[LAST]:
+    made = _written(folder, Source(frame_in_python(columns, once, source)), task)
+    given = len(actions) if isinstance(actions, np.ndarray) else sum(map(len, actions))
+    if lost := given - made.manifest.rows:
         warnings.warn(f"{counted(lost, LAST[0])} {LAST[1]}", Notice, 2)
     return made
 
