@@ -78,11 +78,7 @@ def from_arrays(
     columns = {"observation": observations, "action": actions, "reward": rewards}
     columns |= {"terminated": terminations, "truncated": truncations}
     once = {"final_observation": final_observations, "seed": seeds}
-    made = _written(folder, Source(frame_in_python(columns, once, source)), task)
-    given = len(actions) if isinstance(actions, np.ndarray) else sum(map(len, actions))
-    if lost := given - made.manifest.rows:
-        warnings.warn(f"{counted(lost, LAST[0])} {LAST[1]}", Notice, 2)
-    return made
+    return _written(folder, Source(frame_in_python(columns, once, source)), task)
 
 
 def from_table(
@@ -140,6 +136,8 @@ def _written(
     reward = layout.reward if layout and is_code(layout.reward) else ""
     known = None if task is None else as_task(task)
     write(source, Path(folder), known, missing=missing, reward=reward)
+    if lost := source.changes()[LAST]:
+        warnings.warn(f"{counted(lost, LAST[0])} {LAST[1]}", Notice, 3)
     return Dataset(folder)
 
 
