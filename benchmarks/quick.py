@@ -4,10 +4,11 @@ CPU seconds of a process, the least of three, against limits that a machine with
 too. No mistake in words may import torch.
 """
 
-import resource
 import subprocess
 import sys
 from collections.abc import Sequence
+
+from timing import cpu_of_children
 
 _JBREP = ("-m", "jbrep")
 LIMITS: dict[Sequence[str], float] = {  # of Python's arguments [s]
@@ -25,10 +26,9 @@ LIMITS: dict[Sequence[str], float] = {  # of Python's arguments [s]
 
 
 def cpu_seconds(command: Sequence[str]) -> float:
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = cpu_of_children()
     subprocess.run([sys.executable, *command], capture_output=True, check=False)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return cpu_of_children() - before
 
 
 def main() -> None:

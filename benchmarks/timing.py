@@ -1,5 +1,6 @@
 """What the benchmarks share: to time work, and to show ratios over rounds taken in turn."""
 
+import resource
 import time
 from collections.abc import Callable, Sequence
 
@@ -11,6 +12,12 @@ def timed(work: Callable[[], object]) -> float:
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
+
+
+def cpu_of_children() -> float:
+    """CPU seconds of all processes that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def show(what: str, values: Sequence[float] | np.ndarray, aim: str = "") -> None:

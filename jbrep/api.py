@@ -446,7 +446,7 @@ def clone(
     What is learned from 80 % of the episodes is evaluated on the others, by its actions. Cloning
     keeps the epoch with the least held-out loss. Where the data's environment is here, the policy
     plays it, beside the data's own returns. The result is a run's folder, for every command that
-    takes a policy. The same again resumes a training that was stopped.
+    takes a policy. Repeat it to resume a training that was stopped.
 
     Args:
         data: a folder from jbrep collect or jbrep data import.

@@ -164,12 +164,12 @@ def stop_requested() -> bool:
     return _stop.is_set()
 
 
-def on_cluster(function: Callable[..., Any], cpus: int | None, gpus: int = 0) -> Any:
+def on_cluster(function: Callable[..., Any], cpus: int, gpus: int) -> Any:
     """A function as Ray's remote function, on a core each, called again if its node dies.
 
     Args:
         function: to run.
-        cpus: of the local cluster that is started where RAY_ADDRESS names none; None takes all.
+        cpus: of the local cluster that is started where RAY_ADDRESS names none.
         gpus: that it needs.
     """
     import ray
@@ -179,7 +179,7 @@ def on_cluster(function: Callable[..., Any], cpus: int | None, gpus: int = 0) ->
     return ray.remote(num_cpus=1, num_gpus=gpus, max_retries=ATTEMPTS - 1)(function)
 
 
-def _connect(address: str | None, cpus: int | None) -> None:
+def _connect(address: str | None, cpus: int) -> None:
     """Join the cluster at an address, or start one where none is given."""
     import ray
 

@@ -102,4 +102,4 @@ def test_a_cluster_that_is_not_there_is_told_at_once(address, monkeypatch):
     pytest.importorskip("ray")
     monkeypatch.setenv("RAY_ADDRESS", address)
     with pytest.raises(InputError, match=f"^no Ray cluster at RAY_ADDRESS={address}: "):
-        on_cluster(print, 1)
+        on_cluster(print, 1, 0)

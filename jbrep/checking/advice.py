@@ -49,10 +49,11 @@ def advise(
     Their file stands `where`, `data` is the folder that was read.
     """
     task, features = seen.task, _found(seen, shapes)
-    own = task.whole if data else _own(task) or _own(task, _bounds(task)) or task.whole
+    own = None if data else _own(task)
+    as_given = task.whole if data else own or _own(task, _bounds(task)) or task.whole
     kinds = [[(e.name, e.kind, e.frame) for e in some] for some in (features, task.whole.features)]
     scales = any(each.kind == "scales" for each in findings)
-    use_file = bool(where or kinds[0] != kinds[1] or _told(task.whole) != _told(own) or scales)
+    use_file = bool(where or kinds[0] != kinds[1] or _told(task.whole) != _told(as_given) or scales)
     known = task.whole.replace(features=features) if use_file else task.whole
     hidden = [*(task.view.hidden if task.view else ())]
     for each in findings:
@@ -67,7 +68,7 @@ def advise(
     view = [f"--hide={name}" for name in hidden] + [f"--history={history}"] * (history > 1)
     if data is None:
         file = [f"--features={where or 'features.toml'}"] * use_file
-        given = [*_given(task), *file, *view]
+        given = [*_given(task, own), *file, *view]
         lines = [["rl", *given, "--encoder", system, "--out", "runs/first"]]
     else:
         kind = "identity" if system == "full" else system
@@ -78,14 +79,13 @@ def advise(
     return Advice(system, why, command, features)
 
 
-def _given(task: Task) -> list[str]:
-    """What names a task on a command line, with what was said of its environment."""
+def _given(task: Task, own: Task | None) -> list[str]:
+    """What names a task on a command line, with what its `own` environment doesn't say."""
     made = ["--task", task.name.removesuffix(task.view.suffix if task.view else "")]
     made += [f"--import={each}" for each in modules_of(task)]
     made += [f"--env={each}" for each in task.given_arguments]
     if spec_of(task).max_episode_steps != task.max_episode_steps:
         made.append(f"--episode-steps={task.max_episode_steps}")
-    own = _own(task)
     if own is None or _bounds(own) != _bounds(task):
         bounds = [f"{a:.9g}..{b:.9g}" for a, b in _bounds(task)]
         made.append(f"--action-bounds={','.join(bounds if len({*bounds}) > 1 else bounds[:1])}")

@@ -110,8 +110,8 @@ def shapes(seen: Seen) -> tuple[Shapes, list[Finding]]:
         found.append(Finding("copy", names, why, several(names[:1], "--hide "), {"slope": slope}))
     idle = [*flat, *copies]
     others = [i for i in range(len(features)) if i not in (*idle, *turns)]
-    found += [each for i in others for each in (_degrees(seen, i), _saturated(seen, i)) if each]
-    found += [each for i in others if (each := _winds(seen, i))]
+    alone = (_degrees, _saturated, _winds)
+    found += [each for i in others for ask in alone if (each := ask(seen, i))]
     return Shapes(turns, [*flips], idle), [*found, *_scales(seen, others)]
 
 
@@ -161,7 +161,9 @@ def _winds(seen: Seen, i: int) -> Finding | None:
     if not feature.is_angle or high - low <= 2 * np.pi * (1 + _ROOM):
         return None
     why = f"goes from {low:.3g} to {high:.3g} rad: one pose has several values"
-    return Finding("winds", (feature.name,), why, "--encoder coordinates: cosine and sine don't")
+    return Finding(
+        "winds", (feature.name,), why, "--encoder coordinates: after a turn they are the same"
+    )
 
 
 def _in_radians(name: str) -> str:

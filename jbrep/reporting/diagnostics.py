@@ -56,15 +56,15 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
             for settings in [record.labels[run.label].settings]
         )
     ]
-    known: dict[_Encoder, Values] = {}
+    every = list[Path]()
     for pattern in dict.fromkeys((*given, *named)):
         folders = dict.fromkeys(Path(pattern.replace(_TASK, slug(row.task))) for row in used)
         files = [file for each in folders if exists(file := each / EVALUATION)]
         if pattern in given and not files:
             raise InputError(f"no evaluation in {pattern}: jbrep evaluate makes one")
-        for file in files:
-            known = evaluated(file) | known
-    for file in own:
+        every += files
+    known: dict[_Encoder, Values] = {}
+    for file in (*every, *own):
         known = evaluated(file) | known
     try:
         known = {_key(row): row.values for row in read_known(folder, record)} | known

@@ -49,7 +49,9 @@ def check(plan: Plan) -> None:
     for name in plan.study.tasks:
         task = plan.task(name)
         if task.id.startswith(INSTANCE):
-            raise InputError(f"{task.id} is in this process alone, runs aren't: give its class")
+            raise InputError(
+                f"{task.id} exists in this process alone, not in those of runs: give its class"
+            )
         for representation in by_name(plan):
             _check_by_name(plan, representation, task)
     _check_own(plan)

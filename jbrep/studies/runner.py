@@ -34,15 +34,8 @@ from jbrep.studies.tables import REFERENCE_RETURNS, play_references, write_table
 
 ERROR = "error.txt"  # the traceback of a run that crashed
 CRASHED = "crashed"
-_OWN = (
-    STUDY,
-    REGISTRATION,
-    REFERENCE_RETURNS,
-    "data",
-    "encoders",
-    EVALUATIONS,
-    "runs",
-)  # see `make_folder`
+# see `make_folder`
+_OWN = STUDY, REGISTRATION, REFERENCE_RETURNS, "data", "encoders", EVALUATIONS, "runs"
 _PATIENCE = 60.0  # seconds, until runs have written their checkpoints
 _WRITE_EVERY = 1.0  # seconds
 _TELL_EVERY = 30.0  # seconds
