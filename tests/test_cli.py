@@ -263,3 +263,10 @@ def test_a_shell_completes_tasks_kinds_and_encoders(typed, begun, expected):
     completing = ShellComplete(main, {}, "jbrep", "_JBREP_COMPLETE")
     found = completing.get_completions(typed.split(), begun)
     assert [item.value for item in found] == expected
+
+
+def test_help_of_a_kind_has_its_settings_alone():
+    told = jbrep("train-encoder", "--kind", "slow", "--help").output
+    assert "--lags" in told
+    assert "--noise" not in told
+    assert jbrep("train-dae", "--kind", "pca", "--help").exit_code == 0

@@ -16,6 +16,7 @@ import gymnasium
 import pytest
 import robots
 from command import in_this_process, jbrep, mistake, workers_of
+from gymnasium.envs.classic_control import PendulumEnv
 from small import adopt, forge
 
 from jbrep.encoders import load
@@ -430,3 +431,13 @@ def test_a_task_is_described_in_a_study_as_everywhere(tmp_path):
     Plan(study, tmp_path / "it").write()
     with pytest.raises(InputError, match=r"tasks\.Pendulum-v1\.history 3 \(now: 2\)"):
         Plan(other, tmp_path / "it").check_folder()
+
+
+def test_an_instance_is_refused_before_a_study_begins(tmp_path):
+    class Own(PendulumEnv):
+        pass
+
+    task = describe(Own(), episode_steps=20)
+    study = TINY.replace(tasks=(task.id,), representations=("full",), episode_steps=20)
+    with pytest.raises(InputError, match="exists in this process alone"):
+        check(Plan(study, tmp_path))

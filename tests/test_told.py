@@ -126,3 +126,16 @@ def test_marks_of_thousands_are_never_taken_for_decimal_ones(separator, tmp_path
     assert "1,234" in not_imported(log("a.csv", "1,234"), *NAMED)
     _, data = imported(log("b.csv", "0,234"), *NAMED)
     assert data["x"][0] == np.float32(0.234)
+
+
+def test_rows_with_old_readings_are_counted_apart_from_those_dropped(tmp_path):
+    """Silent for 0.6 s, and for 1.5: held for a second, but from the third interval on old."""
+    times = np.arange(60) / 10
+    seen = np.where((np.arange(60) >= 20) & (np.arange(60) < 26), np.nan, times)
+    seen[40:55] = np.nan
+    path = write_csv(tmp_path / "a.csv", {"t": times, "x": seen, "u": times})
+    source = open_sources([str(path)], Layout(actions=("u",), time="t", rate=10, gap=1.0))
+    list(source.episodes())
+    counted = {what: n for (_, what), n in source.changes().items()}
+    assert counted["dropped, as a column was silent for more than 1.0 s"] == 5
+    assert counted["kept with a reading older than two of its usual intervals"] == 4 + 8
