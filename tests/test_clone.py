@@ -68,7 +68,7 @@ def test_a_clone_does_what_its_teacher_did(log, cloned):
     assert min(losses) < 0.1 * losses[0]
     assert told.error.mse == pytest.approx(min(losses), rel=1e-4)
     assert told.error.mse == pytest.approx(np.mean([each.mse for each in told.actions]), rel=1e-4)
-    assert [each.name for each in told.actions] == ["action_0", "action_1"]
+    assert [each.name for each in told.actions] == ["u", "v"]
     assert told.times[0].name == "steps 0-2"
     assert min(each.r2 for each in (*told.actions, *told.times)) > 0.9
     states = log["observation"][:50]

@@ -271,6 +271,8 @@ def test_a_lerobot_data_set(tmp_path):
     told, data = imported(lerobot_folder(tmp_path / "arm"))
     assert data.task.feature_names == ("shoulder.pos", "elbow.pos")
     assert "observation.images.top" in told
+    assert data.task.action_names == ("shoulder.pos", "elbow.pos")
+    assert "shoulder.pos, elbow.pos" in jbrep("data", "info", data.folder).output
     _, few = imported(tmp_path / "arm", "--observations", "observation.state.elbow*", out="few")
     assert few.task.feature_names == ("elbow.pos",)
     jbrep("data", "export", few.folder, "--to", "lerobot", "--out", tmp_path / "out")
@@ -293,6 +295,7 @@ def test_what_is_exported_to_lerobot_has_its_layout_and_comes_back(tmp_path):
     assert back.episodes["length"].tolist() == [8, 9, 10]
     np.testing.assert_array_equal(back["action"][:8], data["action"][:8])
     assert back.task.features == data.task.features
+    assert back.task.action_names == data.task.action_names
     unknown = from_table(
         tmp_path / "unknown", {"x": [0.0, 1, 2], "action": [0.5] * 3}, Layout(length=9)
     )

@@ -256,7 +256,7 @@ def _parts(objective: Cloning, watched: Windows, data: Dataset) -> dict[str, Any
     named = [(f"steps {a:,}-{b - 1:,}", (a <= steps) & (steps < b)) for a, b in pairwise(edges)]
     return {
         "error": part("all", ...),
-        "actions": tuple(part(f"action_{i}", ..., i) for i in range(actions.shape[-1])),
+        "actions": tuple(part(name, ..., i) for i, name in enumerate(data.task.named_actions)),
         "times": tuple(part(name, own) for name, own in named if own.any()),
     }
 

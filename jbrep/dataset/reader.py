@@ -262,6 +262,8 @@ class Dataset:
             "made with": ", ".join(f"{name} {what}" for name, what in about["versions"].items()),
             "fingerprint": about["fingerprint"],
         }
+        if names := self.task.action_names:
+            named["actions"] = ", ".join(names)
         if code := self.manifest.settings.reward:
             named["reward"] = f"by {code}"
         if note := about.get("note"):

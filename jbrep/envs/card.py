@@ -29,6 +29,8 @@ def _facts(task: "Task") -> Iterator[tuple[str, str]]:
     yield "observation", counted(task.size, "feature")
     bounds = map(_range, task.action_low, task.action_high)
     yield "action", f"{counted(task.action_size, 'number')} in {', '.join(dict.fromkeys(bounds))}"
+    if task.action_names:
+        yield "actions", ", ".join(task.action_names)
     step = "" if task.timestep is None else f" of {task.timestep:g} s"
     yield "time limit", f"{task.max_episode_steps:,} steps{step}"
     if task.terminates is None:

@@ -191,6 +191,7 @@ class Task(Record, frozen=True):
             defines its class, by the names of arguments and module; packages have versions instead.
         offsets: of features by name, which are subtracted from what the environment gives, so that
             32 bits hold it: everywhere a feature is what is left.
+        action_names: of an action's numbers, where they have names.
         missing: what becomes of readings that aren't finite: skip ends an episode before one,
             hold:3 has the last one instead, for at most 3 steps. Otherwise they are errors.
         view: what of the environment's observation is seen, if it isn't the current one, whole.
@@ -216,6 +217,7 @@ class Task(Record, frozen=True):
     constants: _Arrays = {}
     files: Mapping[_Part, Sha256] | UnsetType = UNSET  # left out of JSON where there are none
     offsets: Mapping[Word, Finite] | UnsetType = UNSET
+    action_names: Annotated[tuple[Word, ...], Meta(max_length=_MAX_ACTIONS)] | UnsetType = UNSET
     missing: Missing | UnsetType = UNSET
     view: View | UnsetType = UNSET
     domain: Domain | UnsetType = UNSET
@@ -235,6 +237,8 @@ class Task(Record, frozen=True):
         _check_range("a reward", self.reward_low, self.reward_high)
         if len(self.action_low) != len(self.action_high):
             raise InputError("its actions must have as many lower bounds as upper ones")
+        if len(set(self.named_actions)) < self.action_size:
+            raise InputError("its actions must have different names, one for each number")
         if not all(map(float.__le__, self.action_low, self.action_high)):
             raise InputError("each lower bound of its actions must be at most the upper one")
         if self.domain and len(self.domain.spread) not in (0, self.whole.size):
@@ -271,6 +275,11 @@ class Task(Record, frozen=True):
     def action_size(self) -> int:
         """Length k of an action."""
         return len(self.action_low)
+
+    @property
+    def named_actions(self) -> tuple[str, ...]:
+        """Names of an action's numbers, (k,): action_0 and so on where they have none."""
+        return self.action_names or tuple(f"action_{i}" for i in range(self.action_size))
 
     @property
     def known_timestep(self) -> float:

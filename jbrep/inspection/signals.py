@@ -62,8 +62,8 @@ def send_signals(recording: Recording, rollout: Rollout) -> None:
     titles, times = [str(feature) for feature in task.features], times_at(task, states)
     send_features(recording, "observation", times, task, rollout.observation, titles)
     acting = times_at(task, states[:-1])
-    bounds = zip(task.action_low, task.action_high, strict=True)
-    names = [f"action_{i} [{low:g}, {high:g}]" for i, (low, high) in enumerate(bounds)]
+    taken = zip(task.named_actions, task.action_low, task.action_high, strict=True)
+    names = [f"{name} [{low:g}, {high:g}]" for name, low, high in taken]
     for name, place in numbered_panels("action", task.action_size).items():
         recording.send_series(name, acting, rollout.action[:, place], names[place])
     if np.isfinite(rollout.reward).any():

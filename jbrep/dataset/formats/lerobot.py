@@ -179,8 +179,7 @@ def _write_meta(dataset: Dataset, folder: Path, fps: float) -> None:
     tasks = pa.table({"task_index": [0], _INDEX: [task.name]})
     tasks = tasks.replace_schema_metadata({"pandas": json.dumps(_OF_PANDAS)})
     pq.write_table(tasks, folder / "meta/tasks.parquet")
-    names = {_STATE: list(task.feature_names)}
-    names["action"] = [f"action_{i}" for i in range(task.action_size)]
+    names = {_STATE: list(task.feature_names), "action": list(task.named_actions)}
     features, stats = dict[str, Any](), dict[str, Any]()
     for name, values in _columns(dataset, 0, 0, fps).items():
         shape = list(values.shape[1:]) or [1]

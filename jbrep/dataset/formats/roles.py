@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from jbrep.dataset.formats.frame import ALIASES, About, Frame, check_names, own_names, width
@@ -147,9 +148,8 @@ def is_of_task(frame: Frame, roles: Roles) -> bool:
 
 def features_of(name: str, leaves: list[Leaf]) -> tuple[Feature, ...]:
     """The features by the names and units of their columns; name is the frame's."""
-    shorts, features, pi = Counter(each.short for each in leaves), list[Feature](), math.pi
-    names = words(each.short if shorts[each.short] == 1 else each.name for each in leaves)
-    for each, word in zip(leaves, names, strict=True):
+    features, pi = list[Feature](), math.pi
+    for each, word in zip(leaves, _words(leaves), strict=True):
         if not each.is_angle:
             known = each.feature or Feature(name=word)
             features.append(known.replace(name=word, unit=each.unit[:40]))
@@ -164,6 +164,17 @@ def features_of(name: str, leaves: list[Leaf]) -> tuple[Feature, ...]:
                 f"{name} has the angle {each.name!r} in {each.unit!r}: give rad or deg"
             )
     return tuple(features)
+
+
+def action_names_of(leaves: list[Leaf]) -> tuple[str, ...] | UnsetType:
+    """Names of actions after their columns, unless those only number them."""
+    is_numbered = all(_ACTION.fullmatch(each.short) for each in leaves)
+    return UNSET if is_numbered else _words(leaves)
+
+
+def _words(leaves: list[Leaf]) -> tuple[str, ...]:
+    shorts = Counter(each.short for each in leaves)
+    return (*words(each.short if shorts[each.short] == 1 else each.name for each in leaves),)
 
 
 def check_radians(name: str, leaf: Leaf) -> None:

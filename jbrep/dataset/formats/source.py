@@ -20,6 +20,7 @@ from jbrep.dataset.formats.roles import (
     WIDE,
     Leaf,
     Turns,
+    action_names_of,
     check_radians,
     features_of,
     is_of_task,
@@ -34,7 +35,8 @@ Array = NDArray[Any]
 
 _SIGNALS = ("observation", "action", "reward")
 _EXACT = ("time", "episode")  # of which no digit may be lost
-_ALIKE = ("task", "features", "has_rewards", "action_bounds", "subtracted")  # of several sources
+# in several sources:
+_ALIKE = ("task", "features", "action_names", "has_rewards", "action_bounds", "subtracted")
 LAST = ("row", "at the end of an episode, which has no next state: dropped")
 
 
@@ -47,6 +49,7 @@ class Source:
         name: for messages and provenance.
         task: that they are of; None if one is made from the data alone.
         features: of that one.
+        action_names: likewise.
         action_bounds: lower and upper ones, (2, k); infinite where there are none.
         subtracted: offsets of features that observations lack already, (d,).
         timestep: from row to row [s], if that is known.
@@ -74,6 +77,7 @@ class Source:
         other = "its columns aren't those of its task"
         self.why_no_task = other if frame.task else frame.why_no_task
         self.features = () if is_own else features_of(frame.name, seen)
+        self.action_names = action_names_of(self._roles["action"])
         places = [leaf.place or 0 for leaf in self._roles["action"]]
         self.action_bounds = frame.action_bounds and np.array(frame.action_bounds)[:, places]
         self.subtracted = self._factors * [each.subtracted for each in seen]

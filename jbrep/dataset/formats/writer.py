@@ -265,6 +265,7 @@ def _from_data(source: Source, survey: _Survey) -> Task:
             name=source.frame.label,
             features=source.features,
             offsets=offsets or UNSET,
+            action_names=source.action_names,
             action_low=tuple(low.tolist()),
             action_high=tuple(high.tolist()),
             max_episode_steps=max(*survey.lengths, source.frame.max_episode_steps or 0),
