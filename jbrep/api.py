@@ -266,12 +266,12 @@ def train_encoders(
     Args:
         data: a folder from jbrep collect, of which 80 % of the episodes are learned from.
         out: a folder for the encoder files; a training that was stopped goes on from there.
-        kind: dae, pca, slow, ...; jbrep train-encoder --help lists them with their settings.
+        kind: one of dae, pca, slow, ...; jbrep train-encoder --help lists them with their settings.
         latent: sizes; empty for a kind that has none.
         seeds: make so many of each, of the seeds from 0 on: NAME-s0, NAME-s1, ...
-        name: what files and tables call it; by default, what it is, such as dae-8.
+        name: in files and tables; by default kind and size, such as dae-8.
         preset: named settings; of dae: authors, its authors' own.
-        device: where: cpu, cuda, or auto.
+        device: cpu, cuda, or auto.
         settings: of the kind, such as on="symmetry".
     """
     from jbrep.methods.registry import each_named, with_preset
@@ -298,7 +298,7 @@ def evaluate(
             modules, functions.
         data: that they are evaluated on.
         out: a folder for evaluation.json; None to write nothing.
-        policy: one that does the task well: a run's folder, or a policy by name; by default the
+        policy: that does the task well: a run's folder, or a policy by name; by default the
             task's scripted policy, if it has one.
         truth: the data set that `data` was derived from, with what it hides: how well an encoder
             estimates what isn't seen.
@@ -377,10 +377,10 @@ def train(
     Args:
         task: that it learns.
         out: a folder for this run.
-        seed: of the agent and the episodes.
-        threads: of a batch, as many as cores by default. 1 is one instance of another environment,
-            as of a robot that exists once: num_envs is 1, in the preset modern unless one is named,
-            and evaluations wait for the end of an episode.
+        seed: random seed of the agent and its episodes.
+        threads: threads that step a batch, as many as cores by default. 1 is one instance of
+            another environment, as of a robot that exists once: num_envs is 1, in the preset modern
+            unless one is named, and evaluations wait for the end of an episode.
         begin_from: begin with the final weights of a finished run of the same algorithm and sizes,
             such as one on another body; optimisers and SAC's entropy coefficient start anew.
         stop: asked before each rollout; once it is true, the run writes a checkpoint and stops.
@@ -451,13 +451,13 @@ def clone(
     Args:
         data: a folder from jbrep collect or jbrep data import.
         out: a folder for this policy.
-        seed: of the initial weights and the order of the data.
-        steps: of the gradient, at most, in whole epochs; by default 20,000, of TD3+BC 100,000.
+        seed: random seed of the initial weights and the order of the data.
+        steps: gradient steps, at most, in whole epochs; by default 20,000, of TD3+BC 100,000.
         overrides: a setting of the network or its training, such as net_arch=[64,64],
             learning_rate=1e-3 or batch_size=512; of TD3+BC gamma, tau, policy_delay, ..., too; may
             be repeated.
-        episodes: that it plays, those that every run is evaluated on.
-        device: where: cpu, cuda, or auto.
+        episodes: to play, those that every run is evaluated on.
+        device: cpu, cuda, or auto.
         settings: method, loss, chunk, patience, alpha.
     """
     from jbrep.dataset import Dataset

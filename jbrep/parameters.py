@@ -34,15 +34,15 @@ Retries = Annotated[
     Meta(
         ge=0,
         le=1_000_000,
-        description="How often in a row an environment that fails is made anew and tried again.",
+        description="Times in a row that an environment that fails is made anew.",
     ),
 ]
 Episodes = Annotated[
-    int, Meta(ge=1, le=10_000, description="How many episodes, the same each time.")
+    int, Meta(ge=1, le=10_000, description="Episodes to play, the same each time.")
 ]
 Backend = Annotated[
     str,
-    Meta(description="Where: local, this machine, or ray, the cluster that RAY_ADDRESS names."),
+    Meta(description="Where it runs: local, or ray, the cluster that RAY_ADDRESS names."),
 ]
 Workers = Annotated[
     Annotated[int, Meta(ge=1, le=1024)] | None,
@@ -81,7 +81,7 @@ Algorithm = Annotated[str, Meta(description=f"One of {', '.join(ALGORITHMS)}.")]
 Preset = Annotated[
     str,
     Meta(
-        description="Its settings: paper, modern, wide, or a TOML file with a table for each "
+        description="Hyperparameters: paper, modern, wide, or a TOML file with a table for each "
         "algorithm.",
         extra={"default": "wide, or modern where that has none"},
     ),
@@ -101,13 +101,13 @@ Normalize = Annotated[
 Seen = Annotated[
     Any,
     Meta(
-        description="What it observes: full, the scaled observation; coordinates, symmetry, one "
-        "that ships; an encoder's file; or code as module:Class, which is run.",
+        description="What the agent observes: full, the scaled observation; coordinates, symmetry, "
+        "one that ships; an encoder's file; or code as module:Class, which is run.",
         extra={"is_code": True},
     ),
 ]
 Acting = Annotated[Any, Meta(extra={"is_code": True})]  # a policy by a name or its code, or itself
-AsJson = Annotated[bool, Meta(description="As JSON, for programs.", extra={"option": "json"})]
+AsJson = Annotated[bool, Meta(description="Print JSON, for programs.", extra={"option": "json"})]
 
 
 def described(

@@ -39,7 +39,7 @@ def inspect(
     observed, and for the Jitterbug the decoded robot beside the true one.
 
     Args:
-        episode: its number, from 0; 0 if not given.
+        episode: episode number, from 0; 0 if not given.
         encoder: a file, a name that ships, or code, mymodule:MyEncoder; a run's own if not given.
         traverse: vary each unit of the latent, and show what is decoded.
         out: an .rrd file; one in inspect/ if not given.
@@ -92,10 +92,10 @@ def render(
 
     Args:
         out: a new file, .mp4 or .gif.
-        episode: its number, from 0.
+        episode: episode number, from 0.
         camera: one that the robot's model has: of the Jitterbug overhead, tracking or egocentric.
             If not given, one that follows the robot.
-        size: of each picture; default 640x480, in a GIF 320x240.
+        size: size of each picture; default 640x480, in a GIF 320x240.
         fps: frames per second; default 25, in a GIF 12.5.
         speed: 0.25 is slow motion.
         seconds: simulated seconds to show, from the start; all if not given.

@@ -17,7 +17,7 @@ PolicySettings = Mapping[str, Any]  # a kind and its constants
 
 
 Steps = Annotated[
-    int, Meta(ge=1, le=10**12, description="How many; the last episode is completed.")
+    int, Meta(ge=1, le=10**12, description="Steps to collect; the last episode is completed.")
 ]
 RootSeed = Annotated[int, Meta(ge=0, le=MAX_ROOT_SEED, description="Root of every episode's seed.")]
 ShardEpisodes = Annotated[

@@ -44,7 +44,7 @@ def latent_units(encoder: BaseEncoder, held_out: HeldOut) -> LatentUnits:
 
 @diagnostic(
     Scalar("dead", "units that hardly vary", better=-1),
-    Scalar("participation", "how many directions the code fills (participation ratio)"),
+    Scalar("participation", "how many directions the latent fills (participation ratio)"),
 )
 def usage(e: Judged) -> tuple[Score, Score]:
     """As `latent_units` has it."""

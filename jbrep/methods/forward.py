@@ -39,7 +39,7 @@ _SMALL = 1e-6  # standard deviation of a target that says nothing
 
 
 class LinearForward(Directions, frozen=True, kw_only=True):
-    """Linear forward code: what the row says, beyond the actions, of what comes next.
+    """What a row says linearly, beyond the actions, of what comes next.
 
     It is reduced-rank regression of that on the row and the actions (Izenman 1975; predictive
     states: Littman et al. 2001). Targets, at each horizon k: the change of each number over k

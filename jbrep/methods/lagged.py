@@ -86,7 +86,7 @@ class Slow(Directions, frozen=True, kw_only=True):
 
 
 class Vamp(Directions, frozen=True, kw_only=True):
-    """The linear code most correlated with the state a lag later, given the actions (VAMP).
+    """The linear latent most correlated with the state a lag later, given the actions (VAMP).
 
     They are the first partial canonical directions of now and later, given the actions between.
     With covariances C of the rows x now and y a lag later after their linear regression on the

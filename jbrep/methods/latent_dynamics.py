@@ -24,7 +24,7 @@ _SMALL = 1e-6  # standard deviation of a reward that says nothing
 
 
 class DeepMDP(Network, Learned, frozen=True, kw_only=True):
-    """A code from which reward and next code follow smoothly, with the action."""
+    """A latent from which reward and next latent follow smoothly, with the action."""
 
     name: ClassVar[str] = "deepmdp"
 
@@ -37,13 +37,13 @@ class DeepMDP(Network, Learned, frozen=True, kw_only=True):
         super().check_data(data)
         if not self.reward:
             raise InputError(
-                "deepmdp without reward makes a constant code, which is easy to predict: give the "
-                "reward a weight above 0"
+                "deepmdp without reward makes a constant latent, which is easy to predict: give "
+                "the reward a weight above 0"
             )
         if not data.reward_varies:
             raise InputError(
                 f"deepmdp needs a reward that varies, and there is none in {data.dataset.folder}: "
-                "the code would be constant"
+                "the latent would be constant"
             )
 
     def objective(self, data: ScaledDataset) -> Objective:
@@ -123,7 +123,7 @@ class DeepMDPObjective(Objective):
 
 
 class SelfPrediction(Network, Learned, frozen=True, kw_only=True):
-    """A code that tells, with the action, the next code; on a mean magnitude of 1 (SALE)."""
+    """A latent that tells, with the action, the next one; on a mean magnitude of 1 (SALE)."""
 
     name: ClassVar[str] = "self-prediction"
 
@@ -133,7 +133,7 @@ class SelfPrediction(Network, Learned, frozen=True, kw_only=True):
         super().check_data(data)
         if self.latent == 1:
             raise InputError(
-                "self-prediction divides a code by its average magnitude, which leaves a single "
+                "self-prediction divides a latent by its average magnitude, which leaves a single "
                 "unit only its sign: use a latent size of at least 2"
             )
 

@@ -94,7 +94,7 @@ def whitening(
 
 
 class PCA(Coded, ClosedForm, frozen=True, kw_only=True):
-    """The first l principal components: of all linear codes, the least error."""
+    """The first l principal components: the linear encoder of least error."""
 
     name: ClassVar[str] = "pca"
     min_reduction: ClassVar[int | None] = 0

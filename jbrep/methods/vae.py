@@ -48,7 +48,7 @@ class Variational(Network, Reconstructing, frozen=True, kw_only=True):
 
 
 class Vae(Variational, frozen=True, kw_only=True):
-    """Variational autoencoder with a sigmoid decoder; the code is the mean.
+    """Variational autoencoder with a sigmoid decoder; the latent is the mean.
 
     Kingma and Welling 2014; Higgins et al. 2017.
     """
@@ -158,7 +158,7 @@ def sigmoid_layers(layers: Layers) -> Layers:
 
 
 class LldVae(Variational, frozen=True, kw_only=True):
-    """The authors' LLD-VAE (E2C): a variational code that moves linearly with the action.
+    """The authors' LLD-VAE (E2C): a variational latent that moves linearly with the action.
 
     "Embed to Control", Watter et al. 2015. Here deviations of both likelihoods are bounded, for
     else that of a feature that is constant or a function of others has no greatest value; pairs

@@ -82,15 +82,15 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
         Meta(
             ge=0,
             le=MAX_STEPS,
-            description="In control steps of training.",
+            description="Control steps of training between evaluations.",
             extra={"default": "a tenth of all, at least 10,000"},
         ),
     ] = 0
     evaluation_episodes: Annotated[
         Episodes,
         Meta(
-            description="Of the deterministic policy, each time, from starts that training doesn't "
-            "use."
+            description="Episodes of each evaluation of the deterministic policy, from starts that "
+            "training doesn't use."
         ),
     ] = 5
     final_episodes: Annotated[

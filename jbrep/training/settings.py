@@ -53,12 +53,12 @@ Epochs = Annotated[int, Meta(ge=1, le=_MAX_SEED, description="Passes over the da
 BatchSize = Annotated[
     Annotated[int, Meta(ge=1, le=_MAX_SEED)] | None,
     Meta(
-        description="Rows in a batch; by default 128 to 8192, from the rows, unless the method has "
+        description="Rows in a batch; by default 128 to 8192, from the rows, unless the kind has "
         "its own.",
     ),
 ]
-LearningRate = Annotated[float, Meta(gt=0, le=1, description="Of Adam.")]
-Seed = Annotated[int, Meta(ge=0, le=_MAX_SEED, description="Of everything random.")]
+LearningRate = Annotated[float, Meta(gt=0, le=1, description="Learning rate of Adam.")]
+Seed = Annotated[int, Meta(ge=0, le=_MAX_SEED, description="Random seed.")]
 NoiseDeviation = Annotated[
     float, Meta(ge=0, le=sys.float_info.max, description="Standard deviation of the corruption.")
 ]
@@ -69,4 +69,4 @@ FeatureWeights = Annotated[
     Meta(description="Weights of features, or of patterns, in the error; 1 otherwise."),
 ]
 RewardWeight = Annotated[Weight, Meta(description="Weight of the reward.")]
-TransitionWeight = Annotated[Weight, Meta(description="Weight of the error of the next code.")]
+TransitionWeight = Annotated[Weight, Meta(description="Weight of the error of the next latent.")]
