@@ -10,7 +10,9 @@ import gymnasium
 import pytest
 from command import in_this_process, jbrep
 
+from jbrep.dataset import Dataset
 from jbrep.evaluation import regression
+from jbrep.rl.files import read_run
 from jbrep.studies.runner import BACKENDS
 
 ROOT = Path(__file__).parent.parent
@@ -44,9 +46,10 @@ LOG = "t,angle,cmd_0\n" + "".join(
 )
 
 
-def commands(page):
-    """A page's, in order."""
+def commands(page, section=""):
+    """A page's, in order; of a section, those under its heading."""
     text = (ROOT / page).read_text()
+    text = text.partition(section)[2].partition("\n#")[0] if section else text
     return [
         shlex.split(line, comments=True) for line in re.findall(r"^ {4}jbrep (.*)$", text, re.M)
     ]
@@ -88,6 +91,18 @@ def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
         gymnasium.registry.pop("MyRobot-v0", None)
     for made in ("features.toml", "mine.onnx", "runs/demo/report.html", "runs/clone/run.json"):
         assert (tmp_path / made).stat().st_size, made
+
+
+@pytest.mark.filterwarnings("ignore")  # of very short runs
+def test_an_agents_own_data_lead_to_a_latent_and_to_an_agent_on_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(regression, "_STEPS", 100)
+    monkeypatch.chdir(tmp_path)
+    for words in commands("docs/representations.md", "### Data that show the task"):
+        told = jbrep(*lessened(words))
+        assert told.exit_code == 0, (words, told.output)
+    policy = Dataset("data/own").manifest.settings.policy
+    assert [part["kind"] for _, part in policy["parts"]] == ["uniform", "trained"]
+    assert read_run(tmp_path / "runs/small").latent_size == 8
 
 
 @pytest.mark.slow
