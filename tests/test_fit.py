@@ -96,12 +96,12 @@ def test_scaling_is_fitted_on_the_training_part_only(data, tmp_path):
 def whole(data, tmp_path_factory):
     """The file of a training that nothing stopped."""
     folder = tmp_path_factory.mktemp("whole")
-    return Fitter(data, folder).fit("dae", **how(epochs=12, batch_size=50)).path
+    return Fitter(data, folder).fit("dae", **how(epochs=6, batch_size=50)).path
 
 
 def test_a_stopped_training_resumes_to_the_same_file(whole, collected, tmp_path):
     out, work = tmp_path / "stopped", tmp_path / "stopped" / "dae-4.training"
-    training = ("--latent", 4, "--batch-size", 50, "--epochs", 12)
+    training = ("--latent", 4, "--batch-size", 50, "--epochs", 6)
     command = ("train-dae", *training, "--data", collected, "--out", out)
     process = start(*command)
     assert wait_for((work / "checkpoint.safetensors").exists, process), process.communicate()[1]
@@ -111,7 +111,7 @@ def test_a_stopped_training_resumes_to_the_same_file(whole, collected, tmp_path)
     assert process.returncode == 128 + signal.SIGTERM
     assert f"the same command resumes it; the best so far is in {out}" in told
     kept = load(path).header.metrics
-    assert 1 <= kept["best_epoch"] <= kept["epochs"] < 12
+    assert 1 <= kept["best_epoch"] <= kept["epochs"] < 6
     assert "dae-4: reconstructs held-out states" in jbrep(*command).output
     assert path.read_bytes() == whole.read_bytes()
 

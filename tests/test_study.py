@@ -324,6 +324,7 @@ MIXED = (
 )
 
 
+@pytest.mark.slow  # tests/test_pool.py kills workers in seconds
 @pytest.mark.usefixtures("one_figure")
 def test_two_workers_of_which_one_is_killed_make_the_same(tmp_path, monkeypatch):
     """They import a robot's package; the report is made where that is missing."""
