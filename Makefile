@@ -54,7 +54,7 @@ check: docs ## lint, types, import direction, links of the documentation
 	$(BIN)/lint-imports
 
 bench: $(READY) ## speed as ratios in one run, and what the scripted policies return
-	for each in quick throughput dataset encoders methods learning inspection heuristics environments; do \
+	for each in quick throughput dataset encoders methods learning settings inspection heuristics environments; do \
 	  MUJOCO_GL=disable KINETO_LOG_LEVEL=10 $(BIN)/python benchmarks/$$each.py || exit; \
 	done
 
