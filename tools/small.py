@@ -1,0 +1,92 @@
+"""How small? Returns and their spread over latent size: python tools/small.py OUT.png FOLDER ...
+
+A column for each task of the studies, a line for each method; representations are called
+METHOD-SIZE, the others, such as symmetry, are levels.
+"""
+
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jbrep.evaluation.evaluation import Score
+from jbrep.records.storage import write_whole
+from jbrep.reporting.figures.panels import PAGE, Plot, reference, styles
+from jbrep.reporting.findings import Findings, Group
+from jbrep.reporting.tables import read_tables
+
+_NAME = re.compile(r"(?P<method>[a-z-]+)-(?P<size>\d+)$")
+_SHOWN = {"final_return_mean": "mean final return", "final_return_sd": "SD over runs"}
+
+
+class Point(NamedTuple):
+    """A number of the agents on one representation."""
+
+    task: str
+    method: str
+    size: int  # 0 of a level
+    number: str  # a key of _SHOWN
+    value: Score
+
+
+def points(groups: Sequence[Group]) -> Iterator[Point]:
+    """Those of all agents."""
+    for group in groups:
+        for agents in group.agents:
+            found = _NAME.match(agents.representation)
+            method = found["method"] if found else agents.representation
+            for number in _SHOWN:
+                size = int(found["size"]) if found else 0
+                yield Point(group.task, method, size, number, agents.numbers[number])
+
+
+def draw(groups: Sequence[Group]) -> Figure:
+    """Means above, standard deviations below; dashed: the best blind baseline."""
+    every = [*points(groups)]
+    tasks = [*dict.fromkeys(each.task for each in every)]
+    methods = [*dict.fromkeys(each.method for each in every if each.size)]
+    blind = {group.task: group.ends["blind"] for group in groups}
+    levels = [*dict.fromkeys(each.method for each in every if not each.size)]
+    look = styles([*levels, *methods])
+    figure = Figure(figsize=(PAGE, 3.6))
+    panels = figure.subplots(2, len(tasks), squeeze=False, sharex=True, sharey="row")
+    for row, number in enumerate(_SHOWN):
+        for axes, task in zip(panels[row], tasks, strict=True):
+            own = [each for each in every if (each.task, each.number) == (task, number)]
+            for i, method in enumerate(methods):
+                some = sorted((e for e in own if e.method == method), key=lambda each: each.size)
+                if some:
+                    at = np.array([each.size for each in some]) + 0.12 * (i - len(methods) / 2)
+                    values = np.array([each.value for each in some], float)
+                    spread = np.abs(values[:, 1:].T - values[:, 0])
+                    style = {"color": look[method]["color"], "marker": look[method]["marker"]}
+                    axes.errorbar(at, values[:, 0], spread, **style, ms=3.5, lw=1, label=method)
+            for level in [each for each in own if not each.size]:
+                style = {"color": look[level.method]["color"], "lw": 1, "label": level.method}
+                axes.axhline(float(level.value.value or 0), **style)
+            if not row:
+                axes.axhline(blind[task] or 0.0, **{**reference(), "label": "best blind baseline"})
+                axes.set_title(task)
+            axes.set_ylim(bottom=0)
+        panels[row][0].set_ylabel(_SHOWN[number])
+    for axes in panels[-1]:
+        axes.set(xticks=(2, 4, 6, 8, 12), xlabel="latent size l")
+    found = dict(zip(*panels[0][0].get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=len(found))
+    return figure
+
+
+def main(out: str, *folders: str) -> None:
+    groups = [g for each in folders for g in Findings.of(read_tables(Path(each))).groups]
+    for each in points(groups):
+        if each.number == "final_return_mean":
+            print(each.task, each.method, each.size or "", f"{each.value.value:.0f}")
+    write_whole(Path(out), Plot("small", "", "", [], lambda _: draw(groups)).picture("png"))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
