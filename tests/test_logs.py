@@ -272,6 +272,9 @@ def test_a_lerobot_data_set(tmp_path):
     assert data.task.feature_names == ("shoulder.pos", "elbow.pos")
     assert "observation.images.top" in told
     assert data.task.action_names == ("shoulder.pos", "elbow.pos")
+    for wrong in (("a",), ("a", "a"), ("a", "b", "c"), ("a", "b", "b")):
+        with pytest.raises(InputError, match="one for each number"):
+            data.task.replace(action_names=wrong)
     assert "shoulder.pos, elbow.pos" in jbrep("data", "info", data.folder).output
     _, few = imported(tmp_path / "arm", "--observations", "observation.state.elbow*", out="few")
     assert few.task.feature_names == ("elbow.pos",)

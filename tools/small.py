@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jbrep.evaluation.evaluation import Score
 from jbrep.records.storage import write_whole
-from jbrep.reporting.figures.panels import PAGE, Plot, reference, styles
+from jbrep.reporting.figures.panels import PAGE, Look, Plot, reference, styles
 from jbrep.reporting.findings import Findings, Group
 from jbrep.reporting.tables import read_tables
 
@@ -48,26 +49,16 @@ def draw(groups: Sequence[Group]) -> Figure:
     """Means above, standard deviations below; dashed: the best blind baseline."""
     every = [*points(groups)]
     tasks = [*dict.fromkeys(each.task for each in every)]
-    methods = [*dict.fromkeys(each.method for each in every if each.size)]
     blind = {group.task: group.ends["blind"] for group in groups}
-    levels = [*dict.fromkeys(each.method for each in every if not each.size)]
-    look = styles([*levels, *methods])
+    look = styles([*dict.fromkeys(each.method for each in every)])
     figure = Figure(figsize=(PAGE, 3.6))
     panels = figure.subplots(2, len(tasks), squeeze=False, sharex=True, sharey="row")
     for row, number in enumerate(_SHOWN):
         for axes, task in zip(panels[row], tasks, strict=True):
             own = [each for each in every if (each.task, each.number) == (task, number)]
-            for i, method in enumerate(methods):
-                some = sorted((e for e in own if e.method == method), key=lambda each: each.size)
-                if some:
-                    at = np.array([each.size for each in some]) + 0.12 * (i - len(methods) / 2)
-                    values = np.array([each.value for each in some], float)
-                    spread = np.abs(values[:, 1:].T - values[:, 0])
-                    style = {"color": look[method]["color"], "marker": look[method]["marker"]}
-                    axes.errorbar(at, values[:, 0], spread, **style, ms=3.5, lw=1, label=method)
-            for level in [each for each in own if not each.size]:
-                style = {"color": look[level.method]["color"], "lw": 1, "label": level.method}
-                axes.axhline(float(level.value.value or 0), **style)
+            for method in dict.fromkeys(each.method for each in own):
+                of_method = [each for each in own if each.method == method]
+                _draw_method(axes, of_method, look[method])
             if not row:
                 axes.axhline(blind[task] or 0.0, **{**reference(), "label": "best blind baseline"})
                 axes.set_title(task)
@@ -78,6 +69,17 @@ def draw(groups: Sequence[Group]) -> Figure:
     found = dict(zip(*panels[0][0].get_legend_handles_labels()[::-1], strict=True))
     figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=len(found))
     return figure
+
+
+def _draw_method(axes: Axes, own: Sequence[Point], look: Look) -> None:
+    """A line over sizes with 95 % intervals, or a level."""
+    sizes, name = [each.size for each in own], own[0].method
+    values = np.array([each.value for each in own], float)
+    if sizes == [0]:
+        axes.axhline(values[0, 0], color=look["color"], lw=1, label=name)
+    else:
+        spread = np.abs(values[:, 1:].T - values[:, 0])
+        axes.errorbar(sizes, values[:, 0], spread, **look, ms=3.5, lw=1, label=name)
 
 
 def main(out: str, *folders: str) -> None:

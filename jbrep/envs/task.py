@@ -237,7 +237,7 @@ class Task(Record, frozen=True):
         _check_range("a reward", self.reward_low, self.reward_high)
         if len(self.action_low) != len(self.action_high):
             raise InputError("its actions must have as many lower bounds as upper ones")
-        if len(set(self.named_actions)) < self.action_size:
+        if not len(set(self.named_actions)) == len(self.named_actions) == self.action_size:
             raise InputError("its actions must have different names, one for each number")
         if not all(map(float.__le__, self.action_low, self.action_high)):
             raise InputError("each lower bound of its actions must be at most the upper one")
