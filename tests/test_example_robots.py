@@ -5,6 +5,9 @@ from pathlib import Path
 import pytest
 
 import jbrep
+from jbrep.encoders import find
+from jbrep.envs.names import import_modules
+from jbrep.errors import Notice
 from jbrep.studies.config import read_study
 from jbrep.studies.plan import Plan
 from jbrep.studies.prepare import check
@@ -23,9 +26,7 @@ def learning(monkeypatch):
 def robots(monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
     monkeypatch.chdir(FOLDER)
-    import mybots
-
-    return mybots
+    import_modules(["mybots", "reacher"])
 
 
 @pytest.mark.parametrize(
@@ -41,6 +42,13 @@ def robots(monkeypatch):
         ),
         ("RawCartPole-v0", {}, {"wraps": ("obs_2",)}, "coordinates", ("--features=features.toml",)),
         ("AcroCart-v0", {}, {"winds": ("elbow",)}, "coordinates", ()),
+        (
+            "RawReacher-v0",
+            {"features": "reacher.toml"},
+            {"winds": ("shoulder",)},
+            "coordinates",
+            ("--features=features.toml",),
+        ),
     ],
 )
 def test_what_is_found_of_a_robot_and_what_its_command_needs(
@@ -53,12 +61,20 @@ def test_what_is_found_of_a_robot_and_what_its_command_needs(
     assert kinds == found
     assert made.advice.representation == recommended
     given = made.advice.command.split()
-    assert {"--import=mybots", *options} <= {*given}
+    module = "reacher" if "Reacher" in name else "mybots"
+    assert {f"--import={module}", *options} <= {*given}
     if not options:
         assert not [each for each in given if each.startswith(("--action", "--episode"))]
 
 
-def test_their_study_can_start(tmp_path):
-    plan = Plan(read_study(FOLDER / "study.toml"), tmp_path)
-    assert len(plan.cells) == 24
+@pytest.mark.parametrize(("file", "runs"), [("study.toml", 24), ("arm.toml", 50)])
+def test_their_studies_can_start(file, runs, tmp_path):
+    plan = Plan(read_study(FOLDER / file), tmp_path)
+    assert len(plan.cells) == runs
     check(plan)
+
+
+def test_turned_and_shifted_the_arm_has_the_same_symmetry():
+    task = jbrep.describe("RawReacher-v0", features="reacher.toml")
+    with pytest.warns(Notice, match="the reward 0 at every step"):
+        assert find("symmetry", task).latent_size == 7

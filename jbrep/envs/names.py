@@ -8,6 +8,7 @@ import re
 import shlex
 import sys
 import sysconfig
+import warnings
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import cache
@@ -87,7 +88,9 @@ def import_modules(modules: Iterable[str]) -> None:
         try:
             if "" not in sys.path:
                 sys.path.append("")  # after all that is installed
-            import_module(module)
+            with warnings.catch_warnings():  # dm_control opens OpenGL
+                warnings.filterwarnings("ignore", ".*DISPLAY environment variable is missing")
+                import_module(module)
         except Exception as error:
             raise InputError(f"can't import {module}: {kind_and_line(error)}") from None
         if module not in _imported:
@@ -209,8 +212,6 @@ def _distributions() -> Mapping[str, list[str]]:
 
 def _import_shimmy() -> None:
     """Register dm_control's tasks; it opens OpenGL, and complains of a missing display."""
-    import warnings
-
     from jbrep.opengl import prepare_opengl
 
     prepare_opengl()
