@@ -77,4 +77,4 @@ def test_their_studies_can_start(file, runs, tmp_path):
 def test_turned_and_shifted_the_arm_has_the_same_symmetry():
     task = jbrep.describe("RawReacher-v0", features="reacher.toml")
     with pytest.warns(Notice, match="the reward 0 at every step"):
-        assert find("symmetry", task).latent_size == 7
+        assert find("symmetry", task).latent_size == 9
