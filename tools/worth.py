@@ -28,7 +28,7 @@ from jbrep.errors import InputError
 from jbrep.evaluation.evaluation import EVALUATION, Evaluation
 from jbrep.evaluation.table import headline
 from jbrep.records.document import read_document
-from jbrep.reporting.evaluation import judge
+from jbrep.reporting.evaluation import AS_GOOD, judge
 from jbrep.reporting.tables import Tables, read_tables
 from jbrep.stats.association import correlation_of_ranks, over_families
 from jbrep.stats.bootstrap import Array, Interval
@@ -193,12 +193,14 @@ def apart(task: Scored) -> Iterator[str]:
 
 
 def advised(task: Scored) -> tuple[str, ...]:
-    """What the code to take returned, the recommended on average, the others, the best."""
+    """What the code to take returned, those recommended on average, those by *reward*, the best."""
     returns = dict(zip(task.codes, task.returns, strict=True))
     others = [code for code in task.codes if code not in task.good]
+    reward, _ = task.pairs[REWARD][0]
+    by_reward = [task.codes[i] for i in np.flatnonzero(reward >= AS_GOOD * reward.max())]
     told = (
         f"{len(codes)}: {np.mean([returns[code] for code in codes]):.0f}" if codes else "none"
-        for codes in (task.good, others)
+        for codes in (task.good, others, by_reward)
     )
     best = max(returns, key=returns.__getitem__)
     taken = f"{task.taken} {returns[task.taken]:.0f}" if task.taken else "none"
@@ -259,7 +261,8 @@ def main(*folders: str) -> None:
     title = f"Of two codes, how often that with more {REWARDED} returned more, by their difference"
     print(f"\n{Table(title, ('task', *differences), [(e.task, *apart(e)) for e in tasks]).text()}")
     title = "Mean final returns of the code to take by jbrep evaluate, and of all recommended"
-    header = ("task", "to take", "recommended", "the others", "best of all")
+    by_reward = f"if by {REWARD}"
+    header = ("task", "to take", "recommended", "the others", by_reward, "best of all")
     print(f"\n{Table(title, header, [advised(each) for each in tasks]).text()}")
     for each in tasks:
         print(f"\n{by_code(each).text()}")

@@ -15,7 +15,7 @@ _MEASURES = {  # of which the first that the full observation tells anything of 
     "mean": "the features' change",
 }
 _TOLD = 0.1  # R² of it from the full observation, at least
-_AS_GOOD = 0.9  # the share of the best R² from which a code serves as well
+AS_GOOD = 0.9  # the share of the best R² from which a code serves as well
 _MANY = 8  # features that are named
 _CHOSEN_BY = "rewarded"  # whose interval is shown
 
@@ -62,8 +62,8 @@ def judge(evaluation: Evaluation) -> Judged:
             f"{evaluation.data.test_rows:,} held-out steps"
         )
         return Judged("", unknown=nothing if horizon else untold(evaluation))
-    by = f"R² of {_MEASURES[name]} over {horizon} steps, at least {_AS_GOOD:.0%} of the best"
-    misses, least = missed(evaluation), _AS_GOOD * max(r2.values())
+    by = f"R² of {_MEASURES[name]} over {horizon} steps, at least {AS_GOOD:.0%} of the best"
+    misses, least = missed(evaluation), AS_GOOD * max(r2.values())
     codes = sorted((label for label in r2 if label != FULL), key=lambda label: -r2[label])
     enough = [label for label in codes if r2[label] >= least]
     some = [label for label in codes if r2[label] >= _TOLD]
