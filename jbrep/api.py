@@ -418,11 +418,7 @@ def train(
         _note_limits(now.settings)
     with closing(Bar(run.steps, f"{algorithm} on {found.name}")) as bar:
         session = Session(
-            bar.show,
-            stop=stop,
-            keep_checkpoint=True,
-            threads=threads or cores(),
-            retries=retries,
+            bar.show, stop=stop, keep_checkpoint=True, threads=threads or cores(), retries=retries
         )
         record = train_run(run, folder, session, found)
     return Agent(folder, record, None if isinstance(encoder, str | Path) else encoder)

@@ -41,8 +41,7 @@ Episodes = Annotated[
     int, Meta(ge=1, le=10_000, description="Episodes to play, the same each time.")
 ]
 Backend = Annotated[
-    str,
-    Meta(description="Where it runs: local, or ray, the cluster that RAY_ADDRESS names."),
+    str, Meta(description="Where it runs: local, or ray, the cluster that RAY_ADDRESS names.")
 ]
 Workers = Annotated[
     Annotated[int, Meta(ge=1, le=1024)] | None,
@@ -95,8 +94,7 @@ Overrides = Annotated[
     ),
 ]
 Normalize = Annotated[
-    bool,
-    Meta(description="Normalise what the agent sees by its running mean and variance."),
+    bool, Meta(description="Normalise what the agent sees by its running mean and variance.")
 ]
 Seen = Annotated[
     Any,

@@ -105,12 +105,7 @@ class Relations:
         actions, states = ([np.roll(x, k, 0) for k in range(1, PAST + 1)] for x in (action, state))
         now = np.hstack((state, action))
         acted = np.hstack((now, *actions))
-        return {
-            "now": now,
-            "acted": acted,
-            "all": np.hstack((acted, *states)),
-            "action": action,
-        }
+        return {"now": now, "acted": acted, "all": np.hstack((acted, *states)), "action": action}
 
     # regressions
 

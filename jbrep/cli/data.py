@@ -91,11 +91,7 @@ def info(data: Path, /, *, as_json: AsJson = False) -> None:
 
 @command("data verify data/face --replay 50")
 def verify(
-    data: Path,
-    /,
-    *,
-    replay: Annotated[int, Meta(ge=0, le=10**9)] = 0,
-    threads: Threads = None,
+    data: Path, /, *, replay: Annotated[int, Meta(ge=0, le=10**9)] = 0, threads: Threads = None
 ) -> bool:
     """Check the hash of every shard, and the ranges of what is in them.
 

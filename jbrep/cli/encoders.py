@@ -178,13 +178,7 @@ def export(encoder: _Which, /, out: Path, *, task: OptionalTask = None) -> None:
 
 @command("encoder import model.onnx --task face_direction --out encoders/mine.safetensors")
 def import_model(
-    model: Path,
-    /,
-    task: NeededTask,
-    out: Path,
-    *,
-    decoder: Path | None = None,
-    name: str = "",
+    model: Path, /, task: NeededTask, out: Path, *, decoder: Path | None = None, name: str = ""
 ) -> None:
     """Make an encoder file from an ONNX model.
 

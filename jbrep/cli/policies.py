@@ -45,12 +45,7 @@ def policies() -> None:
 
 @command("policy export runs/a --out controller.onnx")
 def export(
-    policy: str,
-    /,
-    out: NewFile,
-    *,
-    task: TaskName = None,
-    with_example: bool = False,
+    policy: str, /, out: NewFile, *, task: TaskName = None, with_example: bool = False
 ) -> None:
     """Write a policy as one ONNX model, from raw observations to actions.
 

@@ -14,11 +14,7 @@ from jbrep.text import terminal_width
 
 
 @command("rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a")
-def _rl(
-    task: DrawnTask,
-    out: Path,
-    **options: Annotated[Any, api.train],
-) -> bool:
+def _rl(task: DrawnTask, out: Path, **options: Annotated[Any, api.train]) -> bool:
     with stop_signals() as received:
         from jbrep.encoders.shipped import source_of
         from jbrep.envs.infos import shares_text

@@ -151,10 +151,7 @@ def train_dae(**options: Annotated[Any, api.train_encoders]) -> None:
     train_encoder("dae", **options)
 
 
-@command(
-    "train-encoder --kind slow --data data/face --latent 8 --out encoders/face",
-    _Making,
-)
+@command("train-encoder --kind slow --data data/face --latent 8 --out encoders/face", _Making)
 def train_encoder(kind: str, **options: Annotated[Any, api.train_encoders]) -> None:
     """Make encoders of any kind.
 

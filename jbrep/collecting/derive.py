@@ -26,11 +26,7 @@ Array = NDArray[Any]
 
 
 def derive(
-    source: Path,
-    folder: Path,
-    hidden: Sequence[str] = (),
-    history: int = 1,
-    reward: str = "",
+    source: Path, folder: Path, hidden: Sequence[str] = (), history: int = 1, reward: str = ""
 ) -> Manifest:
     """Write a data set of any robot with less or more to see, or with other rewards.
 

@@ -81,11 +81,7 @@ def _rotate(v: Columns, q: Columns, sign: int) -> Columns:
     (a, b, c), (w, x, y, z) = v, q
     w = sign * w
     p, q1, r = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
-    return [
-        a + 2 * (y * r - z * q1),
-        b + 2 * (z * p - x * r),
-        c + 2 * (x * q1 - y * p),
-    ]
+    return [a + 2 * (y * r - z * q1), b + 2 * (z * p - x * r), c + 2 * (x * q1 - y * p)]
 
 
 def _into_body(library: Any, columns: Columns, soft: float) -> Columns:

@@ -27,8 +27,7 @@ class Ddae(Reconstructing, frozen=True, kw_only=True):
     name: ClassVar[str] = "ddae"
 
     ahead: Annotated[
-        int,
-        Meta(ge=0, le=MAX_HORIZON, description="Steps ahead of the row that is reconstructed."),
+        int, Meta(ge=0, le=MAX_HORIZON, description="Steps ahead of the row that is reconstructed.")
     ] = 0
     epochs: Epochs = 5
     batch_size: BatchSize = 256

@@ -30,11 +30,7 @@ class Lagged:
     """
 
     def __init__(
-        self,
-        data: ScaledDataset,
-        lags: tuple[int, ...],
-        width: int,
-        now: Callable[[Block], Array],
+        self, data: ScaledDataset, lags: tuple[int, ...], width: int, now: Callable[[Block], Array]
     ):
         longest, count, size, windows = max(lags), len(lags), data.size, 0
         self.now_mean, self.later_mean = np.zeros(width), np.zeros((count, size))

@@ -169,10 +169,7 @@ def encode_gif(frames: Iterable[Image.Image], path: Path, fps: float) -> None:
     first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
 
 
-FORMATS = {
-    ".mp4": Format(encode_mp4, 25, (640, 480)),
-    ".gif": Format(encode_gif, 12.5, (320, 240)),
-}
+FORMATS = {".mp4": Format(encode_mp4, 25, (640, 480)), ".gif": Format(encode_gif, 12.5, (320, 240))}
 
 
 def get_format(path: Path) -> Format:

@@ -52,11 +52,7 @@ class Report(NamedTuple):
         return f"{results_text(self.findings, terminal_width())}\n\n{self.page}"
 
 
-def make_report(
-    folder: Path,
-    out: Path | None = None,
-    evaluations: Sequence[str] = (),
-) -> Report:
+def make_report(folder: Path, out: Path | None = None, evaluations: Sequence[str] = ()) -> Report:
     """Write the tables of the runs below a folder, if there are any, and the report of the tables.
 
     Into `out`, or the same folder, which another process that reports there is waited for.

@@ -58,8 +58,7 @@ class CloneSettings(Record, frozen=True, kw_only=True):
         ),
     ] = 1
     patience: Annotated[
-        int,
-        Meta(ge=1, description="Of cloning: epochs without a lower held-out loss that end it."),
+        int, Meta(ge=1, description="Of cloning: epochs without a lower held-out loss that end it.")
     ] = 10
     alpha: Annotated[
         float, Meta(gt=0, le=10**6, description="Of TD3+BC: weight of the value in its actor.")

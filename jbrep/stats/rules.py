@@ -62,12 +62,10 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
         ),
     ] = FULL
     error: Annotated[
-        _Share,
-        Meta(description="The probability that any of the verdicts is wrong, two-sided."),
+        _Share, Meta(description="The probability that any of the verdicts is wrong, two-sided.")
     ] = 0.05
     margin: Annotated[
-        _Share,
-        Meta(description="By how much of the score (0 to 1) 'not worse' may be lower."),
+        _Share, Meta(description="By how much of the score (0 to 1) 'not worse' may be lower.")
     ] = 0.1
     reference: Annotated[
         str | Annotated[float, Meta(ge=-LARGEST_RETURN, le=LARGEST_RETURN)],

@@ -69,9 +69,7 @@ def ends_of(compared: Compared) -> Ends:
         top = run.top_in_training
     blind = last if compared.on_all_starts else training
     return Ends(
-        blind=blind,
-        blind_in_training=training,
-        top=np.nan if top is None or top <= blind else top,
+        blind=blind, blind_in_training=training, top=np.nan if top is None or top <= blind else top
     )
 
 

@@ -187,7 +187,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         bool | UnsetType,
         Meta(
             description="Evaluate these encoders on their data before the first run; the report "
-            "sets it beside the returns.",
+            "sets it beside the returns."
         ),
     ] = UNSET
     learners: Mapping[str, Mapping[str, Any]] = {}  # the tables of algorithms, by name
@@ -196,7 +196,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         tuple[str, ...],
         Meta(
             description="From jbrep evaluate, whose diagnostics the report sets against returns; "
-            "{task} stands for each task's name.",
+            "{task} stands for each task's name."
         ),
     ] = ()
     verdicts: Rules = Rules()

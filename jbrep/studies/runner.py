@@ -161,11 +161,7 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome
 BACKENDS: dict[str, Backend] = {"local": on_this_machine, "ray": on_ray}
 
 
-def run_study(
-    plan: Plan,
-    backend: Backend = on_this_machine,
-    workers: int | None = None,
-) -> int:
+def run_study(plan: Plan, backend: Backend = on_this_machine, workers: int | None = None) -> int:
     """Collect data, train encoders, and train every agent that hasn't been trained yet.
 
     A study with claims is registered first: beside its file, in a commit, where git has that file.

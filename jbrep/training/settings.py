@@ -54,7 +54,7 @@ BatchSize = Annotated[
     Annotated[int, Meta(ge=1, le=_MAX_SEED)] | None,
     Meta(
         description="Rows in a batch; by default 128 to 8192, from the rows, unless the kind has "
-        "its own.",
+        "its own."
     ),
 ]
 LearningRate = Annotated[float, Meta(gt=0, le=1, description="Learning rate of Adam.")]
