@@ -34,7 +34,7 @@ Retries = Annotated[
     Meta(
         ge=0,
         le=1_000_000,
-        description="Times in a row that an environment that fails is made anew.",
+        description="How often in a row an environment that fails is made anew.",
     ),
 ]
 Episodes = Annotated[
@@ -73,7 +73,6 @@ History = Annotated[
         "actions between.",
     ),
 ]
-Data = Annotated[str, Meta(description="A folder from jbrep collect.", extra={"metavar": "FOLDER"})]
 Out = Annotated[Path, Meta(description="A folder.")]
 NewFile = Annotated[Path, Meta(description="A new file.")]
 Algorithm = Annotated[str, Meta(description=f"One of {', '.join(ALGORITHMS)}.")]

@@ -159,8 +159,15 @@ def features_toml(task: Task, features: Sequence[Feature], findings: Sequence[Fi
         f"# The features of {task.name} as jbrep check found them. Correct names, units and usual",
         "# ranges; docs/coordinates.md says what kinds and frames are.",
     ]
+    of_task = {
+        n: getattr(task, n) for n in ("timestep", "reward_low", "reward_high", "solved_return")
+    }
+    lines.append(
+        toml_text({n: value for n, value in of_task.items() if value is not None}).rstrip()
+    )
     for old, new in zip(task.whole.features, features, strict=True):
         told = [f"# {each.kind}: {each.evidence}" for each in findings if old.name in each.features]
-        said = {key: value for key, value in asdict(new).items() if value not in (None, "", False)}
+        every = {**asdict(new), "offset": (task.offsets or {}).get(old.name)}
+        said = {k: v for k, v in every.items() if v is not None and v is not False and v != ""}
         lines += ["", *told, "[[features]]", toml_text({"unit": "", **said}).rstrip()]
     return "\n".join(lines) + "\n"

@@ -38,7 +38,7 @@ _FAR = 2.0  # times as far, from which on holding actions is worth a try
 class Check(NamedTuple):
     """What was found of a robot or of data."""
 
-    source: str  # "played", or the folder of the data
+    source: str  # "played", or "of" the folder of the data
     findings: list[Finding]  # worst first
     advice: Advice
     notes: list[str]  # what wasn't asked, and why
@@ -85,7 +85,8 @@ class Check(NamedTuple):
         inputs, far = Relations(self.seen, self.shapes, 0).inputs, dict[int, Any]()
         for name, repeat in REPEATS.items():
             far[repeat] = inputs(self.seen.after[self.seen.policy == name])[0].std(axis=0)
-        moves = far[1] > 0
+        if not (moves := far[1] > 0).any():
+            return {}
         return {n: float(np.median(each[moves] / far[1][moves])) for n, each in far.items()}
 
     def text(self, width: int | None = None) -> str:
@@ -121,10 +122,11 @@ class Check(NamedTuple):
         """What else playing tells."""
         spread, rate = self.spread, self.played.rate if self.played else 1.0
         held = ", ".join(f"{repeat} (x{each:.2g})" for repeat, each in spread.items())
-        best = min(repeat for repeat, each in spread.items() if each >= 0.9 * max(spread.values()))
-        advice = f"; try --set action_repeat={best}" if spread[best] > _FAR else ""
+        far = [repeat for repeat, each in spread.items() if each >= 0.9 * max(spread.values())]
+        advice = f"; try --set action_repeat={far[0]}" if far and spread[far[0]] > _FAR else ""
+        told = f"spread of the state by steps that random actions are held: {held}{advice}"
         return {
-            "holding": f"spread of the state by steps that random actions are held: {held}{advice}",
+            "holding": told if spread else "random actions of one step each move nothing",
             "reproducible": "yes" if self.seen.task.reproducible else "no",
             "speed": f"{rate:,.0f} steps/s here: 1M steps take {duration(1e6 / rate)} of play",
         }

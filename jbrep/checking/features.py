@@ -106,7 +106,7 @@ def shapes(seen: Seen) -> tuple[Shapes, list[Finding]]:
         )
     for i, (other, slope) in copies.items():
         names = features[i].name, features[other].name
-        why = f"{slope:.4g} times {names[1]}, but for a constant"
+        why = f"equals {slope:.4g} times {names[1]} plus a constant"
         found.append(Finding("copy", names, why, several(names[:1], "--hide "), {"slope": slope}))
     idle = [*flat, *copies]
     others = [i for i in range(len(features)) if i not in (*idle, *turns)]

@@ -75,7 +75,7 @@ class Relations:
             if i not in (*self._shapes.idle, *inside):
                 made += part
                 owners += [i] * len(part)
-        return np.column_stack(made), np.array(owners)
+        return np.column_stack([rows[:, :0], *made]), np.array(owners)
 
     @cached_property
     def _targets(self) -> tuple[Array, list[int]]:
@@ -163,7 +163,7 @@ class Relations:
             return Finding("reward", (), why, "give a reward that depends on the state")
         share = float((np.abs(reward - usual) > _SMALL * np.ptp(reward)).mean())
         if share < _SPARSE:
-            why = f"{share:.2%} of the steps have another one than {usual:.4g}"
+            why = f"it differs from {usual:.4g} in {share:.2%} of the steps"
             fix = "shape it, as by the distance that is left, or explore by a policy that gets some"
             return Finding("sparse", (), why, fix, {"share": share})
         whole, alone = (self._r2(self._told(name), wanted)[-1] for name in ("now", "action"))

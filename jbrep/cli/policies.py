@@ -72,9 +72,9 @@ def export(
         )
     controller = load_policy(policy_file(policy, describe(task) if task else None))
     loop = out.with_name(f"{out.stem}_loop.py")
+    write(controller, out)
     if with_example:
         write_new(loop, EXAMPLE.read_bytes())
-    write(controller, out)
     said, own = described(controller), controller.task
     rate = "" if said["rate"] is None else f", {said['rate']:g} times a second"
     say(f"{out}: {own.size} numbers of {own.name} to {own.action_size}{rate}")

@@ -20,8 +20,6 @@ from jbrep.envs.task import Task
 from jbrep.envs.view import seen_in_episodes, with_view
 from jbrep.errors import InputError, differences
 
-_ENVS = 500
-
 Array = NDArray[Any]
 
 

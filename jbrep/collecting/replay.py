@@ -66,7 +66,7 @@ def why_otherwise(manifest: Manifest) -> str:
 def simulate_again(
     episodes: Sequence[Episode], read: Read, tick: Tick, num_threads: int | None = None
 ) -> Recording:
-    """Play episodes of one data set again, one in each environment, then with other actions."""
+    """Play episodes of one data set again, each in an environment of its own."""
     dataset = episodes[0].dataset
     if dataset.manifest.settings.is_imported:
         raise InputError("imported episodes can't be simulated again")

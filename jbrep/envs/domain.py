@@ -120,7 +120,7 @@ def read_ranges(given: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in given.items():
         kind = choose(name, kinds, "part of a domain")
         ends = [*map(str.strip, value.split(".."))] if isinstance(value, str) else value
-        ends = ends if isinstance(ends, list) else [ends]
+        ends = ends if isinstance(ends, list | tuple) else [ends]
         ranges[name] = converted(ends * 2 if len(ends) == 1 else ends, kind, name, strict=False)
     return ranges
 

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import cache
 from importlib import import_module, metadata
+from itertools import count
 from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
@@ -165,10 +166,15 @@ def taken_for(given: Any) -> tuple[str, dict[str, Any]]:
         usual = {**gymnasium.spec(made.id).kwargs, "render_mode": made.kwargs.get("render_mode")}
         differing = {n: v for n, v in made.kwargs.items() if n not in usual or usual[n] != v}
         return made.id, differing
-    name = f"{INSTANCE}{type(given.unwrapped).__name__}"
+    kind = f"{INSTANCE}{type(given.unwrapped).__name__}"
+    names = (f"{kind}-{number}" if number else kind for number in count())
+    name = next(each for each in names if _instances.setdefault(each, given) is given)
     lent = _Lent(given)
     limit = made.max_episode_steps if made else None
     return _registered(name, lambda: lent, limit), {}
+
+
+_instances: dict[str, gymnasium.Env[Any, Any]] = {}  # of users, by their ids
 
 
 def _registered(name: str, maker: Any, limit: int | None = None) -> str:

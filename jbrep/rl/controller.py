@@ -257,7 +257,6 @@ def load_policy(source: str | Path, encoder: Any = None) -> Controller:
     from jbrep.rl.policy import load_run  # imports torch
 
     trained = load_run(path, encoder)
-    assert trained.settings is not None
     weights = {name: each.numpy() for name, each in acting(trained.policy).state_dict().items()}
     return Controller(trained.settings, trained.encoder, weights, trained.statistics)
 

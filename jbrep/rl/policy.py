@@ -92,7 +92,7 @@ class Trained(NamedTuple):
         return self._held(deterministic_actor(self.policy, self.task, preprocess, batch_size=1))
 
     def _held(self, act: Actor) -> Actor:
-        return held(_finite(act), self.action_repeat, self.settings.chunk if self.settings else 1)
+        return held(_finite(act), self.action_repeat, self.settings.chunk)
 
     def with_weights(self, weights: Tensors, tensors: Tensors, source: Path) -> "Trained":
         """The policy with weights of the part that acts, and statistics among tensors."""

@@ -85,7 +85,6 @@ class Session(NamedTuple):
     save_every: float = 60  # seconds between checkpoints, at least
     # asked before each rollout; once it is true, a checkpoint is written and training ends
     stop: Callable[[], bool] = lambda: False
-    # of stable-baselines3's logger, that get what TensorBoard gets
     # whether a run that has ended keeps a checkpoint, from which it can go on
     keep_checkpoint: bool = False
     threads: int = 1  # that step environments

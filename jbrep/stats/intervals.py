@@ -1,58 +1,14 @@
 """Intervals over runs, each by the method that covered best in simulations.
 
-Coverage [%] of 95 % intervals for 5, 10 and 20 runs per group, drawn from a normal distribution,
-from a skewed one (1000 minus a gamma variable of shape 2), and from Student's t distribution with 5
-degrees of freedom (600 to 40,000 samples each):
-
-                                         normal              skewed              heavy tails
-    mean: Student's t                    94.9  93.8  95.1    91.3  93.4  93.1    96.4  95.3  95.7
-      bootstrap-t                        94.7  93.3  95.0    92.9  95.4  93.9    94.5  93.0  93.8
-      percentile bootstrap               83.5  88.9  92.3    80.1  89.5  90.9    84.3  89.5  92.0
-    ratio of variances: Bonett's         97.9  96.1  95.5    97.2  95.5  95.2    97.0  95.7  95.2
-      with variances of 4 to 1           97.1  95.4  96.2    96.3  94.0  93.9    96.0  93.8  94.1
-      bootstrap-t of jackknife errors    98.0  93.9  94.0    96.5  91.0  93.0    97.2  94.4  92.1
-      percentile bootstrap               96.9  93.4  92.0    95.6  88.5  90.4    95.5  92.1  90.0
-    SD: Bonett's                         99.5  95.7  94.9    98.7  93.1  90.3    98.9  95.2  91.9
-      percentile bootstrap               63.6  76.7  85.9    52.3  65.1  75.1    54.5  68.3  76.5
-    median: percentile bootstrap         93.7  92.3  94.8    93.4  94.1  92.9    93.6  93.1  93.9
-    IQM: percentile bootstrap            89.5  92.2  94.5    89.7  94.9  93.6    89.7  93.3  94.7
-    P(improvement): the same             90.2  92.8  94.8    89.8  94.0  94.2    91.3  93.8  94.3
-      with means an SD apart             84.8  91.5  94.3    86.0  91.2  94.5    84.2  91.5  92.0
-    IQR: percentile bootstrap            86.8  94.6  97.3    82.5  93.4  94.5    87.1  97.3  97.0
-    MAD: percentile bootstrap            66.9  94.1  97.3    67.1  92.5  94.8    72.1  95.9  96.9
-
-So with five runs a percentile interval is too short. It is kept where the literature uses it, so
-that numbers can be compared (Agarwal et al. 2021); no verdict depends on one. With five runs the
-interval of a ratio of variances is wide: it extends by a factor of ten to both sides.
-
-No interval covers returns of which some are near 900 with an SD of 20, from runs that learn, and
-the others near 50, from runs that don't (40,000 samples each):
-
-                                         a tenth don't       a fifth don't
-    mean: Student's t                    40.9  65.0  87.6    66.2  88.7  91.9
-    ratio of variances: Bonett's         55.9  54.7  78.0    58.8  80.8  94.4
-      of 99.44 %                         94.6  80.7  85.3    93.4  86.5  97.1
-
-because a group in which all runs happen to learn seems to vary little. That is why no verdict
-depends on a ratio of variances, and why those on returns must hold even if as many runs failed as
-can't be excluded (`jbrep.stats.rules`).
+benchmarks/coverage.py has their coverage. With five runs a percentile interval is too short: it is
+kept where the literature uses it, so that numbers can be compared (Agarwal et al. 2021), and no
+verdict depends on one. Where some runs learn and others don't, no interval covers, as a group in
+which all happen to learn seems to vary little: so no verdict depends on a ratio of variances, and
+those on returns must hold even if as many runs failed as can't be excluded (`jbrep.stats.rules`).
 
 Intervals of means stay within what is possible: Student's is taken on a scale on which the task's
 bounds are infinitely far away, of the logit where returns have two bounds, of the logarithm where
-they have one (the delta method). Differences are taken within units (`jbrep.stats.pairs`), under
-Student's t. Of eight encoders with one, two or four runs each, compared with a baseline on the same
-seeds, intervals of 95 % over differences covered [%], beside what could be done instead
-(`python benchmarks/coverage.py`; 4,000 samples each):
-
-                                              encoders           runs, paired       runs, unpaired
-    runs differ                           95.2  95.1  95.2    95.2  94.8  95.3    97.1  95.9  95.5
-    seeds have 0.6 of the variance        95.2  95.1  95.2    95.2  94.8  95.3    99.7  99.8  99.8
-    encoders have 0.6 of it               95.6  95.2  95.2    95.6  91.7  84.7    96.7  92.4  85.2
-    0.4 each                              95.5  95.2  95.2    95.5  91.3  83.9    99.2  97.9  92.3
-      skewed                              95.3  94.8  95.6    95.3  90.7  84.0    99.2  97.1  93.6
-      a tenth fails                       95.2  94.8  95.5    95.2  90.0  82.4    99.0  97.2  92.3
-
-A nested bootstrap of encoders and their runs covered 87 to 98.
+they have one (the delta method). Differences are taken within units (`jbrep.stats.pairs`).
 """
 
 import math

@@ -224,10 +224,10 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
 
     def task(self, name: str) -> Task:
         """A task as the study describes it, and by the name that the study calls it."""
-        of_all = {"env": self.environment, "episode_steps": self.episode_steps}
-        own = {**of_all, "domain": self.domain or {}} | (
-            self.described[name].said if name in self.described else {}
-        )
+        said = self.described[name].said if name in self.described else {}
+        own = {"episode_steps": self.episode_steps, **said}
+        for key, of_all in (("env", self.environment), ("domain", self.domain or {})):
+            own[key] = {**of_all, **said.get(key, {})}
         own.pop("name", None)
         short = {full: each for each, full in SHORT_NAMES.items()}
         return describe(own.pop("task", name), **own).replace(name=short.get(name, name))
