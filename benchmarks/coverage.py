@@ -39,7 +39,7 @@ samples each):
     IQR: percentile bootstrap            86.8  94.6  97.3    82.5  93.4  94.5    87.1  97.3  97.0
     MAD: percentile bootstrap            66.9  94.1  97.3    67.1  92.5  94.8    72.1  95.9  96.9
 
-None covers returns of which some are near 900 with an SD of 20, from runs that learn, and the others
+None covers returns of which some are near 900 with an SD of 20, from runs that learn, and others
 near 50, from runs that don't (40,000 samples each):
 
                                          a tenth don't       a fifth don't
