@@ -1,13 +1,14 @@
 """Jobs side by side: in loky's processes on this machine, or as tasks of a Ray cluster.
 
-This module imports the standard library alone, so that a new process watches its parent before the
-seconds that it takes to import torch.
+This module imports next to nothing but the standard library, so that a new process watches its
+parent before the seconds that it takes to import torch.
 """
 
 import os
 import signal
 import socket
 import threading
+import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
@@ -15,6 +16,8 @@ from contextlib import suppress
 from multiprocessing import Pipe, get_all_start_methods, set_start_method
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
+
+from jbrep.errors import Notice
 
 ATTEMPTS = 5  # at a job whose process is killed
 _ANSWERS_WITHIN = 10.0  # seconds, a cluster
@@ -148,6 +151,13 @@ def _begin(connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which then asks
     signal.signal(signal.SIGTERM, lambda number, frame: None)  # likewise
     threading.Thread(target=_listen, args=(connection,), daemon=True).start()
+    usual = warnings.formatwarning
+
+    def formatted(message: Any, category: type[Warning], *where: Any, **more: Any) -> str:
+        is_notice = issubclass(category, Notice)
+        return f"Note: {message}\n" if is_notice else usual(message, category, *where, **more)
+
+    warnings.formatwarning = formatted
 
 
 def _listen(connection: Connection) -> None:

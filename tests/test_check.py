@@ -92,6 +92,27 @@ def test_a_quaternion_and_scales_become_what_a_features_file_says(tmp_path):
         assert all(each.low < each.high for each in task.features)
 
 
+def test_a_features_file_keeps_zeros_offsets_and_what_is_said_of_the_task(tmp_path):
+    first, again = tmp_path / "first.toml", tmp_path / "again.toml"
+    first.write_text(
+        'timestep = 0.5\nreward_high = 1.0\n[[features]]\nname = "heading"\n[[features]]\n'
+        'name = "speed"\noffset = 3.0\n[[features]]\nname = "tilt"\nlow = 0.0\nhigh = 1.0\n'
+    )
+    task = jbrep.describe("Faulty/Turned-v0", features=first)
+    jbrep.check(task, steps=STEPS, write=again)
+    found = jbrep.describe("Faulty/Turned-v0", features=again)
+    assert found.features[0].is_full_turn
+    assert found.features[0].low == found.features[2].low == 0
+    assert (found.offsets, found.timestep, found.reward_high) == ({"speed": 3.0}, 0.5, 1.0)
+
+
+def test_a_robot_on_which_nothing_moves_is_told_so():
+    told = checked("Dead")
+    assert {each.kind for each in told.findings} >= {"constant"}
+    assert told.spread == told.plain()["spread"] == {}
+    assert "move nothing" in told.text(80)
+
+
 def test_data_are_read_in_place_of_play(tmp_path):
     data = jbrep.collect("Faulty/Wrapped-v0", tmp_path / "data", STEPS)
     check = jbrep.check(data=data)

@@ -110,4 +110,8 @@ def test_the_example_loop_does_as_the_controller(tmp_path, monkeypatch):
 def test_the_example_is_written_beside_the_model(run):
     model = run.with_name("b.onnx")
     assert "b_loop.py" in jbrep("policy", "export", run, "--out", model, "--with-example").output
-    assert model.with_name("b_loop.py").read_bytes() == EXAMPLE.read_bytes()
+    loop = model.with_name("b_loop.py")
+    assert loop.read_bytes() == EXAMPLE.read_bytes()
+    loop.unlink()
+    again = jbrep("policy", "export", run, "--out", model, "--with-example")
+    assert (again.exit_code, loop.exists()) == (2, False)

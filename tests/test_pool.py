@@ -31,6 +31,14 @@ def test_jobs_come_back_with_their_results():
     assert not workers_of(os.getpid())
 
 
+def test_a_worker_tells_a_notice_in_one_line():
+    script = PARENT.format(tests=sys.path, folder="").replace("hang", "note").replace("2", "1")
+    told = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert told.stderr == "Note: it is wet\n"
+
+
 def test_the_job_of_a_dead_worker_is_tried_again(tmp_path):
     assert list(begun(die, [tmp_path], 1)) == [(tmp_path, "survived")]
     assert (tmp_path / "deaths").read_text() == "xxx"

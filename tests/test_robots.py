@@ -14,6 +14,7 @@ from arms import STEPS, Arm
 from command import jbrep, mistake, refused
 from small import contents
 
+from jbrep.api import evaluate_policy
 from jbrep.collecting import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import find_problems
@@ -124,6 +125,25 @@ def test_a_clock_that_32_bits_swallow_is_told_and_shifted(tmp_path):
     np.testing.assert_allclose(dataset["clock"][:], clock, atol=1e-6)
     assert dataset.task.offsets == {"clock": 1764000000.0}
     assert jbrep("data", "verify", tmp_path / "e", "--replay", 1).exit_code == 0
+
+
+def test_two_instances_of_a_class_are_two_robots():
+    class Paid(gymnasium.Env):
+        observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+        def __init__(self, pay):
+            self.pay = pay
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            return np.zeros(1, np.float32), self.pay, False, False, {}
+
+    few, many = (describe(Paid(pay), episode_steps=5) for pay in (1.0, 100.0))
+    assert few.id != many.id
+    assert [evaluate_policy("still", each, 1).returns[0] for each in (few, many)] == [5, 500]
 
 
 # one robot, which fails

@@ -434,6 +434,19 @@ def test_a_task_is_described_in_a_study_as_everywhere(tmp_path):
         Plan(other, tmp_path / "it").check_folder()
 
 
+def test_a_tasks_own_arguments_are_beside_those_of_all(tmp_path):
+    file = written(
+        tmp_path,
+        'tasks = ["Hopper-v5", {task = "Hopper-v5", name = "own", '
+        "env = {reset_noise_scale = 0.1}, domain = {noise = 0.2}}]",
+        "env = {frame_skip = 2}",
+        "domain = {delay = 1}",
+    )
+    task = read_study(file).task("own")
+    assert task.arguments == {"frame_skip": 2, "reset_noise_scale": 0.1}
+    assert (task.domain.delay, task.domain.noise) == ((1, 1), (0.2, 0.2))
+
+
 def test_an_instance_is_refused_before_a_study_begins(tmp_path):
     class Own(PendulumEnv):
         pass

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,7 +51,7 @@ class Finding(NamedTuple):
     features: tuple[str, ...]  # that it is about; none of all
     evidence: str
     fix: str
-    numbers: Mapping[str, Any] = MappingProxyType({})  # that the evidence tells
+    numbers: Mapping[str, Any] = {}  # that the evidence tells
 
     @property
     def title(self) -> str:

@@ -121,7 +121,7 @@ class Described(Record, frozen=True, kw_only=True):
         if isinstance(self.features, str):
             force_setattr(self, "features", read_toml(Path(self.features)))
         read_bounds(self.action_bounds)
-        Domain(**read_ranges(self.domain))
+        Domain(**read_ranges(self.domain), spread=(1.0,))
 
     @property
     def said(self) -> dict[str, Any]:
@@ -213,7 +213,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if len(set(values)) < len(values):
                 raise InputError(f"{name} is {values}: it must have each once")
         self._check_tasks()
-        Domain(**read_ranges(self.domain or {}))
+        Domain(**read_ranges(self.domain or {}), spread=(1.0,))  # not known yet
         self._check_data()
         self._check_verdicts()
 

@@ -129,6 +129,21 @@ class Unseeded(Arm):
         return self.observation(), {}
 
 
+class Dead(Arm):
+    def acts(self, action):
+        return 0 * action
+
+    def observed(self):
+        return {"battery": 0.5, "load": 2.0}
+
+
+class Turned(Arm):
+    """Whose heading goes from 0 to 2 pi."""
+
+    def observed(self):
+        return {"heading": self.angle % (2 * np.pi), **self.joints()}
+
+
 FAULTS = {  # what each is found for, and about which features
     Arm: None,
     Wrapped: ("wraps", ("heading",)),
@@ -146,5 +161,5 @@ FAULTS = {  # what each is found for, and about which features
     Unpredictable: ("reward", ()),
     Unseeded: ("random", ()),
 }
-for _robot in FAULTS:
+for _robot in (*FAULTS, Dead, Turned):
     gymnasium.register(f"Faulty/{_robot.__name__}-v0", entry_point=_robot, max_episode_steps=100)
