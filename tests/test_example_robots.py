@@ -5,9 +5,11 @@ from pathlib import Path
 import pytest
 
 import jbrep
+from jbrep.collecting.derive import derive
 from jbrep.encoders import find
 from jbrep.envs.names import import_modules
 from jbrep.errors import Notice
+from jbrep.evaluation import diagnose
 from jbrep.studies.config import read_study
 from jbrep.studies.plan import Plan
 from jbrep.studies.prepare import check
@@ -26,7 +28,7 @@ def learning(monkeypatch):
 def robots(monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
     monkeypatch.chdir(FOLDER)
-    import_modules(["mybots", "reacher"])
+    import_modules(["mybots", "reacher", "made_up"])
 
 
 @pytest.mark.parametrize(
@@ -72,6 +74,16 @@ def test_their_studies_can_start(file, runs, tmp_path):
     plan = Plan(read_study(FOLDER / file), tmp_path)
     assert len(plan.cells) == runs
     check(plan)
+
+
+def test_places_in_the_world_are_needed_where_the_reward_needs_them(tmp_path):
+    task = jbrep.describe("RawReacher-v0", features="reacher.toml")
+    jbrep.collect(task, tmp_path / "near", 8_000, policy="reacher:reach")
+    derive(tmp_path / "near", tmp_path / "there", reward="made_up:reached")
+    places = {"finger_x", "finger_y", "target_x", "target_y"}
+    needs = {data: diagnose({}, tmp_path / data).needs for data in ("near", "there")}
+    assert not [name for name in places if needs["near"][name]]
+    assert needs["there"]["finger_x"] > 0.1
 
 
 def test_turned_and_shifted_the_arm_has_the_same_symmetry():

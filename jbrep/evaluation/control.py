@@ -1,6 +1,7 @@
 """What a controller needs of the state: a good policy's action and value, and what a code loses."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -9,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from jbrep.coordinates import make_coordinates
 from jbrep.dataset.scaled import sample
 from jbrep.encoders.base import BaseEncoder
+from jbrep.envs.task import Feature
+from jbrep.errors import InputError
 from jbrep.evaluation.evaluation import (
     Judged,
     Lost,
@@ -22,7 +26,7 @@ from jbrep.evaluation.evaluation import (
 )
 from jbrep.evaluation.held_out import HeldOut, Rows, explained, sample_rows
 from jbrep.evaluation.prediction import Matters, following
-from jbrep.evaluation.regression import Networks, Problem
+from jbrep.evaluation.regression import Networks, Problem, fit
 from jbrep.stats.bootstrap import Array, by_episode
 
 GAMMA = 0.99
@@ -33,6 +37,7 @@ _ROWS = 50_000  # at most, to fit on and to judge on
 _NEEDED = 0.1  # need from which a feature is needed
 _KEPT = 0.5  # R^2 from which it is kept
 _PREDICTABLE = 0.1  # R^2 below which nothing can be learnt about what a prediction needs
+_SPARE = 0.02  # of the variance, by which an error may be larger and count as no worse
 _NUMBERS = 1 << 18  # rows times features, at most, in which features are shuffled
 
 
@@ -164,6 +169,10 @@ def needs(
     needs it directly as much as the mean reward of the next 10 steps or, if there is a policy, its
     action or value, whichever needs it most. It needs it indirectly for the change over 10 steps
     of another feature, times how much that one is needed directly.
+
+    Places and headings in the world aren't needed where most of what the reward depends on is among
+    them, and yet it is predicted as well without them, from the task's `symmetry`: of an arm's
+    finger and its target the reward sees the distance alone.
     """
     ahead = nearest_horizon(learnt.forward)
     if ahead is None:
@@ -178,9 +187,35 @@ def needs(
     moving, reward = shares[:, :-1], shares[:, -1]
     of_policy = _of_policy(full, policy, learnt, seen) if policy else []
     direct = np.max([reward, *of_policy], axis=0)
+    world = np.array([_is_of_the_world(each) for each in held_out.data.task.features])
+    if 2 * reward[world].sum() > reward.sum():
+        error = np.square(told(np.hstack((full.encode(seen), inputs))) - steps.wanted[some])
+        most = error[:, -1].mean() + _SPARE * steps.wanted[:, -1].var()
+        if _error_without_the_world(held_out, ahead, some) < most:
+            reward, direct = np.where(world, 0, reward), np.where(world, 0, direct)
     need = np.maximum(direct, (moving * direct).max(axis=1)).tolist()
     names = held_out.data.task.feature_names
     return Needs(reward if reward.any() else None, dict(zip(names, need, strict=True)))
+
+
+def _is_of_the_world(feature: Feature) -> bool:
+    return feature.kind == "point" or (feature.is_angle and feature.frame == "world")
+
+
+def _error_without_the_world(held_out: HeldOut, ahead: int, some: Rows) -> float:
+    """Mean squared error of the reward, predicted from `symmetry`, if there is one, and actions.
+
+    In some of the held-out rows.
+    """
+    coordinates = None
+    with suppress(InputError):
+        coordinates = make_coordinates(held_out.data.task, "symmetry")
+    if coordinates is None:
+        return np.inf
+    train, test = (held_out.once(following, part, ahead) for part in ("train", "test"))
+    values = [np.hstack((coordinates.forward(e.observation), e.action)) for e in (train, test)]
+    (predict,) = fit([Problem(values[0], train.wanted[:, -1:])])
+    return float(np.square(predict(values[1][some]) - test.wanted[some, -1:]).mean())
 
 
 def _of_policy(
