@@ -34,7 +34,8 @@ Retries = Annotated[
     Meta(
         ge=0,
         le=1_000_000,
-        description="How often in a row an environment that fails is made anew.",
+        description="How often in a row an environment that fails is made anew; not when it is "
+        "first tried.",
     ),
 ]
 Episodes = Annotated[

@@ -70,6 +70,8 @@ def advise(
         file = [f"--features={where or 'features.toml'}"] * use_file
         given = [*_given(task, own), *file, *view]
         lines = [["rl", *given, "--encoder", system, "--out", "runs/first"]]
+        if use_file and not where:
+            lines.insert(0, ["check", *_given(task, own)[1:], "--write", "features.toml"])
     else:
         kind = "identity" if system == "full" else system
         again = f"{data}-seen" if view else str(data)
@@ -107,7 +109,7 @@ def _system(task: Task, winds: bool) -> tuple[str, str]:
     """Coordinates where features jump or are longer and turned, else all features."""
     kinds = {each.kind for each in task.features}
     reasons = {
-        "angles jump": any(each.is_full_turn for each in task.features),
+        "angles jump where they wrap": any(each.is_full_turn for each in task.features),
         "angles wind beyond a full turn": winds,
         "a quaternion has two signs": "quaternion" in kinds,
         "offsets have a length and a direction": "offset" in kinds,

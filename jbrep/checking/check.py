@@ -79,7 +79,7 @@ class Check(NamedTuple):
 
     @property
     def spread(self) -> dict[int, float]:
-        """How far random actions drive the state if held, times as far as those of one step."""
+        """How far random actions drive a feature at most if held, as a multiple of one step's."""
         if not self.played:
             return {}
         inputs, far = Relations(self.seen, self.shapes, 0).inputs, dict[int, Any]()
@@ -87,7 +87,7 @@ class Check(NamedTuple):
             far[repeat] = inputs(self.seen.after[self.seen.policy == name])[0].std(axis=0)
         if not (moves := far[1] > 0).any():
             return {}
-        return {n: float(np.median(each[moves] / far[1][moves])) for n, each in far.items()}
+        return {n: float(np.max(each[moves] / far[1][moves])) for n, each in far.items()}
 
     def text(self, width: int | None = None) -> str:
         """It for a terminal."""
@@ -124,7 +124,9 @@ class Check(NamedTuple):
         held = ", ".join(f"{repeat} (x{each:.2g})" for repeat, each in spread.items())
         far = [repeat for repeat, each in spread.items() if each >= 0.9 * max(spread.values())]
         advice = f"; try --set action_repeat={far[0]}" if far and spread[far[0]] > _FAR else ""
-        told = f"spread of the state by steps that random actions are held: {held}{advice}"
+        told = (
+            f"growth of a feature's spread, at most, by steps that actions are held: {held}{advice}"
+        )
         return {
             "holding": told if spread else "random actions of one step each move nothing",
             "reproducible": "yes" if self.seen.task.reproducible else "no",

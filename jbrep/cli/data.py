@@ -41,7 +41,8 @@ def _check(as_json: AsJson = False, **options: Annotated[Any, api.check]) -> Non
     kinds = [[e.kind for e in t] for t in (found.advice.features, found.seen.task.whole.features)]
     if file and not options.get("write") and kinds[0] == kinds[1]:
         word = shlex.quote(f"--features={file}")
-        command = found.advice.command.replace("--features=features.toml", word)
+        *_, command = found.advice.command.split("\n")  # the first one would write the file
+        command = command.replace("--features=features.toml", word)
         found = found._replace(advice=found.advice._replace(command=command))
     say_json(found.plain()) if as_json else say(found.text(terminal_width()))
     for what, path in (("features file", options.get("write")), ("page", options.get("out"))):

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -58,7 +59,7 @@ def export(
         with_example: write a control loop beside it, which checks sensors and needs no jbrep.
     """
     from jbrep.envs.description import describe
-    from jbrep.envs.names import modules_of
+    from jbrep.envs.names import modules_of, spec_of
     from jbrep.play.sources import policy_file
     from jbrep.records.storage import write_new
     from jbrep.rl.controller import EXAMPLE, described, load_policy
@@ -82,7 +83,9 @@ def export(
         say(f"run it with python {loop} {out}")
     modules = [f"--import={module}" for module in modules_of(own)]
     check = ["jbrep", "evaluate-policy", str(out), "--beside", policy, *modules]
-    say(f"check it with {shlex.join(check)}")
+    with suppress(InputError):  # where it comes of a log alone
+        spec_of(own)
+        say(f"check it with {shlex.join(check)}")
 
 
 @command("evaluate-policy runs/a --episodes 100")

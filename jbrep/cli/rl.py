@@ -26,6 +26,7 @@ def _rl(task: DrawnTask, out: Path, **options: Annotated[Any, api.train]) -> boo
             agent = api.train(task, out, stop=lambda: bool(received), **options)
     if agent.record.reason is not None:
         say(f"the run failed: {agent.record.reason}; see {out / RUN}", err=True)
+        tell("to train it again, remove the folder or choose another --out", err=True)
         return True
     returns = agent.returns
     shown = f"final return on {agent.record.settings.representation}"

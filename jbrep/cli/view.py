@@ -56,8 +56,7 @@ def inspect(
     from jbrep.inspection import inspect as record  # imports torch
 
     path = record(source, episode, task, encoder, traverse, out, say)
-    say("the robot, its signals over time, an encoder's latent, and its settings (provenance):")
-    say(f"rerun {quote(str(path))}")
+    say(f"look at it with rerun {quote(str(path))}")
     if view:
         _run_viewer(path)
 

@@ -37,7 +37,7 @@ from jbrep.rl.run_settings import Cloned, RunSettings
 from jbrep.rl.settings import BC, CloneSettings, Line
 from jbrep.rl.training import packages, write_tables
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within
-from jbrep.text import Table, counted, interval, number, r2_text
+from jbrep.text import Table, counted, interval, number, r2_text, wrapped
 from jbrep.training.trainer import Epoch, Schedule, Trainer, get_device, single_thread
 from jbrep.training.windows import Windows, count_windows, watched_windows
 
@@ -98,7 +98,7 @@ class CloneRecord(Document, frozen=True, kw_only=True):
         lines = [kept, Table("", ("", "error", "R²"), rows).text(width)]
         means = (("policy", self.policy), ("data", self.data))
         told = "; ".join(f"{name} {mean}" for name, mean in means if mean)
-        return "\n".join(lines + ([f"mean return [95 %]: {told}"] if told else []))
+        return "\n".join(lines + ([wrapped(f"mean return [95 %]: {told}", width)] if told else []))
 
 
 class Job(NamedTuple):
@@ -275,10 +275,11 @@ def _why_not_played(data: Dataset) -> str:
     try:
         spec_of(data.task)
     except (InputError, ModuleNotFoundError) as error:
-        named = "names no environment" if data.manifest.settings.is_imported else f"needs: {error}"
+        is_log = data.manifest.settings.is_imported
+        why = f"{data.folder} names no environment" if is_log else str(error)
         return (
-            f"{data.folder} {named}, so the policy wasn't played: a low error doesn't say what it "
-            "returns, as errors lead to states that aren't in the data, and to larger errors"
+            f"the policy wasn't played ({why}): a low error doesn't say what it returns, as errors "
+            "lead to states that aren't in the data, and to larger errors"
         )
     return ""
 

@@ -256,7 +256,7 @@ class Dataset:
             "seed": "-" if self.manifest.settings.is_imported else str(about["seed"]),
             "rows": f"{about['rows']:,}{unfinished}",
             "episodes": episodes,
-            "return": _spread_text(returns) if returns else "not known: the data have no rewards",
+            "return": _spread_text(returns) if returns else "not known",
             "columns": ", ".join(about["columns"]),
             "files": f"{counted(about['shards'], 'shard')}, {about['bytes'] / 1e6:,.1f} MB",
             "made with": ", ".join(f"{name} {what}" for name, what in about["versions"].items()),

@@ -132,8 +132,8 @@ def _path(name: str | Path, task: Task) -> Path:
     if not exists(path):
         ships = ", ".join(names(task))
         raise InputError(
-            f"no encoder {str(name)!r}: give a file, or "
-            + (f"one that ships for {task.name}: {ships}" if ships else FULL)
+            f"no encoder {str(name)!r}: give a file, full, coordinates, symmetry"
+            + (f", or one that ships for {task.name}: {ships}" if ships else "")
         )
     return path
 

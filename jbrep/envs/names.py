@@ -63,13 +63,13 @@ def spec_of(task: Task) -> EnvSpec:
     """What is registered under a task's id."""
     try:
         return find_spec(task.id)
-    except InputError:
+    except InputError as error:
         for module in modules_of(task):
             raise InputError(
                 f"unknown task {task.id!r}: {module} defines it; `import` {shlex.quote(module)}, "
                 "or the module that registers it: this runs its code"
             ) from None
-        raise
+        raise InputError(f"{error}. What comes of a log alone has no environment") from None
 
 
 def modules_of(task: Task) -> list[str]:

@@ -21,7 +21,10 @@ _WORDS: dict[str, tuple[str, Any]] = {  # in names, of settings that aren't the 
     "unit": ("codes", "standard"),
     "white": ("codes", "white"),
 }
-_EXAMPLES = "it must be full, or a method and a latent size, such as dae-8, dae-deep-8 or slow-8"
+_EXAMPLES = (
+    "it must be full, coordinates, symmetry, or a method and a latent size, as in dae-8 or "
+    "dae-deep-8"
+)
 
 
 def get_method(name: str) -> type[Method]:

@@ -348,7 +348,7 @@ def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | 
     steps = settings.control_steps(agent.num_timesteps)
     record = RunRecord(
         status=FAILED if failed else FINISHED,
-        reason=f"{printable(str(failed))[: MAX_LINE // 2]} after {steps:,} steps"
+        reason=f"after {steps:,} steps: {printable(str(failed))[: MAX_LINE // 2]}"
         if failed
         else None,
         settings=settings,

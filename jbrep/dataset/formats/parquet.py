@@ -101,7 +101,7 @@ def write(dataset: Dataset, out: Path) -> str:
         _write_steps(dataset, partial, out.name)
         publish(episodes, _beside(out))
         publish(partial, out)
-    return f"pandas.read_parquet({str(out)!r}), and {_beside(out).name} for the episodes"
+    return f"pandas.read_parquet({str(out)!r}); episodes: {_beside(out).name}"
 
 
 def _write_steps(dataset: Dataset, path: Path, name: str) -> None:

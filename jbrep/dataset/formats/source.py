@@ -1,6 +1,7 @@
 """A frame as a source of episodes: read by its layout, cut, and brought to a clock."""
 
 import math
+import shlex
 from collections.abc import Callable, Iterator
 from fnmatch import fnmatchcase
 from itertools import chain
@@ -234,12 +235,12 @@ class Source:
         if self._layout.time and not self._layout.rate and self._clock is None:
             notes.append("the clock is uneven: --rate brings the rows to an even one")
         for leaf, turn in zip(self._roles["observation"], self._turns.found(), strict=False):
-            if turn and not leaf.is_angle:
-                unit = "deg" if turn > MOST_RADIANS else "rad"
-                notes.append(
-                    f"{leaf.name} jumps by a full turn, {turn:.4g}: if it is an angle, give "
-                    f"--angles {leaf.name} --units {leaf.name}={unit}"
-                )
+            unit = "deg" if turn and turn > MOST_RADIANS else "rad"
+            known = leaf.is_angle or (leaf.feature and leaf.feature.is_angle)
+            if turn and not known and leaf.unit in ("", unit, *(DEGREES if unit == "deg" else ())):
+                given = shlex.join(["--angles", leaf.name, "--units", f"{leaf.name}={unit}"])
+                told = f"{leaf.name} jumps by a full turn, {turn:.4g}"
+                notes.append(f"{told}: if it is an angle, give {given}")
         if angles := int(self._angles.sum()):
             degrees = int((self._factors != 1).sum())
             told = f"{counted(angles, 'angle')} brought to [-pi, pi) rad"
