@@ -72,6 +72,14 @@ def test_a_csv_as_loggers_write_it(tmp_path):
     assert "ticks is from 420000000" in told
 
 
+def test_a_jump_by_a_full_turn_is_told_unless_the_unit_denies_it(tmp_path):
+    saw = [round(0.3 * i % 6.28318, 5) for i in range(200)]
+    path = write_csv(tmp_path / "s.csv", {"my turn": saw, "a [deg]": saw, "b [°C]": saw, "u": saw})
+    told, _ = imported(path, "--actions", "u", "--length", "200", out="saw")
+    assert told.count("full turn") == 1
+    assert "--angles 'my turn' --units 'my turn=rad'" in told
+
+
 def test_missing_cells_are_cut_or_held_and_counted(tmp_path):
     path = write_csv(tmp_path / "a.csv", csv_rows(gyro=dict.fromkeys((30, 31), "")))
     assert "a.csv, line 32: 'gyro' is empty" in not_imported(path, *NAMED, "--gap", "1")
