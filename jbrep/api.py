@@ -101,7 +101,7 @@ class Agent(NamedTuple):
         return f"Agent({what}: {told}; {str(self.folder)!r})"
 
 
-class Judged(NamedTuple):
+class Evaluated(NamedTuple):
     """What is known of encoders.
 
     Attributes:
@@ -290,7 +290,7 @@ def evaluate(
     *,
     policy: Acting | None = None,
     truth: "Dataset | str | Path | None" = None,
-) -> Judged:
+) -> Evaluated:
     """Evaluate encoders on the held-out part of a data set.
 
     Args:
@@ -323,8 +323,8 @@ def evaluate(
     found = find_all(encoders, scaled.task)
     good = find_good_policy(policy, scaled.task, own_rewards)
     if out is None:
-        return Judged(diagnose(found, scaled, good, whole))
-    return Judged(write(found, scaled, Path(out), good, whole))
+        return Evaluated(diagnose(found, scaled, good, whole))
+    return Evaluated(write(found, scaled, Path(out), good, whole))
 
 
 def evaluate_policy(

@@ -20,7 +20,7 @@ _MANY = 8  # features that are named
 _CHOSEN_BY = "rewarded"  # whose interval is shown
 
 
-class Judged(NamedTuple):
+class Advice(NamedTuple):
     """Which encoders retain enough for a controller."""
 
     by: str  # what decides, in words
@@ -48,7 +48,7 @@ def _parts(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
     yield _missed_text(evaluation, width)
 
 
-def judge(evaluation: Evaluation) -> Judged:
+def judge(evaluation: Evaluation) -> Advice:
     """By what each encoder predicts, compared with the best, the full observation among them."""
     horizon = evaluation.encoders[FULL].horizon
     for name in _MEASURES:
@@ -61,7 +61,7 @@ def judge(evaluation: Evaluation) -> Judged:
             f"even the full observation predicts next to nothing of these "
             f"{evaluation.data.test_rows:,} held-out steps"
         )
-        return Judged("", unknown=nothing if horizon else untold(evaluation))
+        return Advice("", unknown=nothing if horizon else untold(evaluation))
     by = f"R² of {_MEASURES[name]} over {horizon} steps, at least {AS_GOOD:.0%} of the best"
     misses, least = missed(evaluation), AS_GOOD * max(r2.values())
     codes = sorted((label for label in r2 if label != FULL), key=lambda label: -r2[label])
@@ -70,10 +70,10 @@ def judge(evaluation: Evaluation) -> Judged:
     nearest = min(some, key=lambda label: bool(misses[label]), default=None)
     whole = [label for label in enough if not misses[label]]
     size = {label: evaluation.encoders[label].latent for label in enough}
-    return Judged(by, enough, min(whole or enough, key=size.__getitem__, default=None), nearest)
+    return Advice(by, enough, min(whole or enough, key=size.__getitem__, default=None), nearest)
 
 
-def _headline(evaluation: Evaluation, judged: Judged) -> Table:
+def _headline(evaluation: Evaluation, judged: Advice) -> Table:
     encoders = evaluation.encoders
     first = [name for name, scalar in SCALARS.items() if scalar.is_first]
     names = [n for n in first if any(_score(e, n).value is not None for e in encoders.values())]
