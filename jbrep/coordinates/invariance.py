@@ -18,7 +18,8 @@ from jbrep.envs.task import Array, Task
 from jbrep.envs.view import Window
 from jbrep.errors import InputError, Notice, refusing
 
-_SEEDS, _BEFORE, _AFTER = 3, 10, 5  # episodes; steps before the turn and after it
+_SEEDS, _MOST_SEEDS = 3, 100  # episodes, and at most, where all rewards were the same so far
+_BEFORE, _AFTER = 10, 5  # steps before the turn and after it
 _SAME = 1e-5  # relative difference of rewards and coordinates, as float32 rounds them
 _SHIFT = (0.5, -0.25)  # [m]
 
@@ -83,7 +84,12 @@ def _tried(task: Task) -> list[tuple[Array, Array]]:
     try:
         for _ in range(2):
             envs.append(make_env(spec_of(task).id, task.arguments, task.max_episode_steps))
-        return [step for seed in range(_SEEDS) for step in _played(envs, task, seed)]
+        steps = list[tuple[Array, Array]]()
+        for seed in range(_MOST_SEEDS):
+            steps += _played(envs, task, seed)
+            if seed + 1 >= _SEEDS and len({*np.ravel([reward for _, reward in steps])}) > 1:
+                break
+        return steps
     finally:
         for env in envs:
             env.close()
