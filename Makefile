@@ -16,16 +16,18 @@ help: ## what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
 setup: $(READY) ## a virtual environment with everything in it
-$(READY): $(READY_DEMO)
+$(READY): pyproject.toml constraints.txt | $(VENV)/lib/python$(VERSION)
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[cluster,dm-control,export,learn,logs,render,suite,view,dev]'
-	@touch $@
+	@touch $@ $(READY_DEMO)
 
-$(READY_DEMO): pyproject.toml constraints.txt
-	@case "$(VERSION)" in 3.11|3.12) ;; *) echo "this needs Python 3.11 or 3.12, and $(PYTHON) is" \
-	  "'$(VERSION)' (dm-control's labmaze has no wheels for newer ones): make PYTHON=python3.12 ..."; exit 2;; esac
-	test -d $(VENV)/lib/python$(VERSION) || $(PYTHON) -m venv --clear $(VENV)
+$(READY_DEMO): pyproject.toml constraints.txt | $(VENV)/lib/python$(VERSION)
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dm-control,learn,view]'
 	@touch $@
+
+$(VENV)/lib/python$(VERSION):
+	@case "$(VERSION)" in 3.11|3.12) ;; *) echo "this needs Python 3.11 or 3.12, and $(PYTHON) is" \
+	  "'$(VERSION)' (dm-control's labmaze has no wheels for newer ones): make PYTHON=python3.12 ..."; exit 2;; esac
+	$(PYTHON) -m venv --clear $(VENV)
 
 demo: $(READY_DEMO) ## the whole job in minutes: collect, train and evaluate an encoder, learn, report, record
 	rm -rf $(DEMO)
@@ -45,12 +47,19 @@ test-all: $(READY) ## the same with its slow tests
 coverage: $(READY) ## the test suite, with the lines of jbrep/ that no test runs
 	$(BIN)/python -m pytest --cov
 
-check: docs ## lint, types, import direction, links of the documentation
+check: docs lint types layers ## lint, types, import direction, links of the documentation
+
+.PHONY: lint types layers
+lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: $(READY)
 	$(BIN)/mypy
 	$(BIN)/mypy tools/*.py
 	$(BIN)/mypy benchmarks/*.py
+
+layers: $(READY)
 	$(BIN)/lint-imports
 
 bench: $(READY) ## speed as ratios in one run, and what the scripted policies return

@@ -110,6 +110,7 @@ def test_an_episode_ends_where_its_physics_goes_non_finite(tmp_path, brief):
     assert not list(replay_problems(dataset, 5))
 
 
+@pytest.mark.slow
 def test_kills_lose_at_most_the_open_shard(tmp_path):
     """`python tests/helpers/kills.py 200` does many more."""
     assert kill_and_resume(2, tmp_path, seed=0).kills == 2

@@ -3,11 +3,14 @@
 import runpy
 from argparse import Namespace
 
+import pytest
+
 import jbrep
 
 TASK = jbrep.describe("Pendulum-v1", episode_steps=20)
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_from_its_trials(tmp_path, capsys):
     search = runpy.run_path("examples/tune/tune.py")["main"]
     given = {"task": "Pendulum-v1", "algorithm": "a2c", "steps": 8, "out": tmp_path}
