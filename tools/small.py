@@ -65,7 +65,7 @@ def draw(groups: Sequence[Group]) -> Figure:
             axes.set_ylim(bottom=0)
         panels[row][0].set_ylabel(_SHOWN[number])
     for axes in panels[-1]:
-        axes.set(xticks=(2, 4, 6, 8, 12), xlabel="latent size l")
+        axes.set(xticks=sorted({each.size for each in every} - {0}), xlabel="latent size l")
     found = dict(zip(*panels[0][0].get_legend_handles_labels()[::-1], strict=True))
     figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=len(found))
     return figure
