@@ -32,7 +32,7 @@ def test_jobs_come_back_with_their_results():
 
 
 def test_a_worker_tells_a_notice_in_one_line():
-    script = PARENT.format(tests=sys.path, folder="").replace("hang", "note").replace("2", "1")
+    script = PARENT.replace("hang", "note").replace("2", "1").format(tests=sys.path, folder="")
     told = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )

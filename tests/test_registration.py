@@ -274,9 +274,10 @@ def test_the_committed_results_are_of_the_studies_that_were_registered(path):
     assert given["sha256"] == seal({n: v for n, v in given.items() if n not in head})
     record = read_document(path.with_name(RECORD), RunsRecord)
     assert record.registration.sha256 == given["sha256"]
-    if path.parent.name == "sooner":  # whose file, of robots of its own, is in examples/robots
+    name = f"{path.parent.name}.toml"
+    if (ROOT / "examples/robots" / name).exists():  # of robots that aren't known here
         return
-    study = read_study(ROOT / "studies" / f"{path.parent.name}.toml")
+    study = read_study(ROOT / "studies" / name)
     assert record.study.replace(title="", evaluations=()) == study.replace(title="", evaluations=())
 
 

@@ -100,7 +100,7 @@ def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
     result = train(run, tmp_path)
     assert result.status == FAILED
     assert f"at step 7 of the episode with seed {training_seed(0) + 3}" in result.reason
-    assert result.reason.endswith(" after 48 steps")  # of 8 environments
+    assert result.reason.startswith("after 48 steps: ")  # of 8 environments
     assert read_run(tmp_path) == result
     assert [row.step for row in read_evaluations(tmp_path)] == [0]
     assert not (tmp_path / POLICY).exists()
@@ -200,7 +200,7 @@ def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(tmp_path, monkeypatch)
         )  # once the episode of now has been played again
         told = jbrep(*settings, folder, "--steps", 320)
     assert told.exit_code == 1
-    assert "the run failed: out of order" in told.stderr
+    assert "steps: out of order" in told.stderr
     assert {name: (folder / name).read_bytes() for name in kept} == before
     assert load_run(folder).settings.steps == 160
     for each in (folder, whole):
