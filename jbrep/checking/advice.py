@@ -23,7 +23,8 @@ from jbrep.errors import InputError
 from jbrep.records.document import toml_text
 
 # what a features file says
-_told = attrgetter("features", "offsets", "timestep", "reward_low", "reward_high", "solved_return")
+_OF_TASK = "timestep", "reward_low", "reward_high", "solved_return"  # in a features file
+_told = attrgetter("features", "offsets", *_OF_TASK)
 _USUAL = 0.01, 0.99  # quantiles of what was seen: a usual range, where none is known
 
 
@@ -161,12 +162,8 @@ def features_toml(task: Task, features: Sequence[Feature], findings: Sequence[Fi
         f"# The features of {task.name} as jbrep check found them. Correct names, units and usual",
         "# ranges; docs/coordinates.md says what kinds and frames are.",
     ]
-    of_task = {
-        n: getattr(task, n) for n in ("timestep", "reward_low", "reward_high", "solved_return")
-    }
-    lines.append(
-        toml_text({n: value for n, value in of_task.items() if value is not None}).rstrip()
-    )
+    known = {name: getattr(task, name) for name in _OF_TASK}
+    lines.append(toml_text({k: v for k, v in known.items() if v is not None}).rstrip())
     for old, new in zip(task.whole.features, features, strict=True):
         told = [f"# {each.kind}: {each.evidence}" for each in findings if old.name in each.features]
         every = {**asdict(new), "offset": (task.offsets or {}).get(old.name)}

@@ -39,10 +39,11 @@ def _check(as_json: AsJson = False, **options: Annotated[Any, api.check]) -> Non
     found = api.check(options.pop("task", None), **options)
     file = click.get_current_context().params.get("features")
     kinds = [[e.kind for e in t] for t in (found.advice.features, found.seen.task.whole.features)]
-    if file and not options.get("write") and kinds[0] == kinds[1]:
-        word = shlex.quote(f"--features={file}")
-        *_, command = found.advice.command.split("\n")  # the first one would write the file
-        command = command.replace("--features=features.toml", word)
+    if file and not options.get("write"):
+        word, command = shlex.quote(f"--features={file}"), found.advice.command
+        if kinds[0] == kinds[1]:  # nothing to write
+            command = command.split("\n")[-1].replace("--features=features.toml", word)
+        command = command.replace(" --write", f" {word} --write")
         found = found._replace(advice=found.advice._replace(command=command))
     say_json(found.plain()) if as_json else say(found.text(terminal_width()))
     for what, path in (("features file", options.get("write")), ("page", options.get("out"))):

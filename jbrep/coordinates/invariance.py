@@ -87,7 +87,7 @@ def _tried(task: Task) -> list[tuple[Array, Array]]:
         steps = list[tuple[Array, Array]]()
         for seed in range(_MOST_SEEDS):
             steps += _played(envs, task, seed)
-            if seed + 1 >= _SEEDS and len({*np.ravel([reward for _, reward in steps])}) > 1:
+            if seed + 1 >= _SEEDS and steps and np.ptp([reward for _, reward in steps]):
                 break
         return steps
     finally:

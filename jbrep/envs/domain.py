@@ -125,6 +125,11 @@ def read_ranges(given: Mapping[str, Any]) -> dict[str, Any]:
     return ranges
 
 
+def check_ranges(given: Mapping[str, Any]) -> None:
+    """Make sure that there is a domain of these, whatever the spread of the features."""
+    Domain(**read_ranges(given), spread=(1.0,))
+
+
 class Draws:
     """Random numbers of n episodes: those of a step follow from its number and the seed.
 

@@ -15,7 +15,7 @@ from jbrep.dataset.manifest import MANIFEST
 from jbrep.dataset.settings import MAX_ROOT_SEED
 from jbrep.encoders.shipped import UNLEARNED
 from jbrep.envs.description import describe, read_bounds
-from jbrep.envs.domain import Domain, read_ranges
+from jbrep.envs.domain import check_ranges
 from jbrep.envs.names import find_spec, taken_for
 from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES, EpisodeSteps, Id, Missing, Task
 from jbrep.errors import InputError, choose
@@ -121,7 +121,7 @@ class Described(Record, frozen=True, kw_only=True):
         if isinstance(self.features, str):
             force_setattr(self, "features", read_toml(Path(self.features)))
         read_bounds(self.action_bounds)
-        Domain(**read_ranges(self.domain), spread=(1.0,))
+        check_ranges(self.domain)
 
     @property
     def said(self) -> dict[str, Any]:
@@ -213,7 +213,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if len(set(values)) < len(values):
                 raise InputError(f"{name} is {values}: it must have each once")
         self._check_tasks()
-        Domain(**read_ranges(self.domain or {}), spread=(1.0,))  # not known yet
+        check_ranges(self.domain or {})
         self._check_data()
         self._check_verdicts()
 

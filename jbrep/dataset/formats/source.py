@@ -18,6 +18,7 @@ from jbrep.dataset.formats.frame import Frame, width
 from jbrep.dataset.formats.roles import (
     DEGREES,
     MOST_RADIANS,
+    RADIANS,
     WIDE,
     Leaf,
     Turns,
@@ -235,9 +236,10 @@ class Source:
         if self._layout.time and not self._layout.rate and self._clock is None:
             notes.append("the clock is uneven: --rate brings the rows to an even one")
         for leaf, turn in zip(self._roles["observation"], self._turns.found(), strict=False):
-            unit = "deg" if turn and turn > MOST_RADIANS else "rad"
+            is_degrees = turn is not None and turn > MOST_RADIANS
+            unit, units = ("deg", DEGREES) if is_degrees else ("rad", RADIANS)
             known = leaf.is_angle or (leaf.feature and leaf.feature.is_angle)
-            if turn and not known and leaf.unit in ("", unit, *(DEGREES if unit == "deg" else ())):
+            if turn and not known and leaf.unit in ("", *units):
                 given = shlex.join(["--angles", leaf.name, "--units", f"{leaf.name}={unit}"])
                 told = f"{leaf.name} jumps by a full turn, {turn:.4g}"
                 notes.append(f"{told}: if it is an angle, give {given}")
