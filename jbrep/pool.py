@@ -18,6 +18,7 @@ from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 from jbrep.errors import Notice
+from jbrep.text import noted
 
 ATTEMPTS = 5  # at a job whose process is killed
 _ANSWERS_WITHIN = 10.0  # seconds, a cluster
@@ -154,8 +155,9 @@ def _begin(connection: Connection) -> None:
     usual = warnings.formatwarning
 
     def formatted(message: Any, category: type[Warning], *where: Any, **more: Any) -> str:
-        is_notice = issubclass(category, Notice)
-        return f"Note: {message}\n" if is_notice else usual(message, category, *where, **more)
+        if not issubclass(category, Notice):
+            return usual(message, category, *where, **more)
+        return f"{noted(str(message))}\n"
 
     warnings.formatwarning = formatted
 

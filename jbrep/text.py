@@ -1,6 +1,7 @@
 """Text for a terminal: numbers, tables and facts that fit its width."""
 
 import math
+import os
 import re
 import shutil
 import sys
@@ -57,6 +58,12 @@ def wrapped(text: str, width: int | None) -> str:
     if width is None:
         return text
     return textwrap.fill(text, width, break_on_hyphens=False, break_long_words=False)
+
+
+def noted(message: str) -> str:
+    """A notice as a terminal shows it: wrapped, but for one with a path, which may be copied."""
+    line = printable(f"Note: {message}")
+    return line if os.sep in line else wrapped(line, terminal_width())
 
 
 def terminal_width() -> int:

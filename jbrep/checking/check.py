@@ -38,7 +38,7 @@ _FAR = 2.0  # times as far, from which on holding actions is worth a try
 class Check(NamedTuple):
     """What was found of a robot or of data."""
 
-    source: str  # "played", or "of" the folder of the data
+    data: Path | None  # the folder of the data that was checked; None if the task was played
     findings: list[Finding]  # worst first
     advice: Advice
     notes: list[str]  # what wasn't asked, and why
@@ -58,7 +58,7 @@ class Check(NamedTuple):
         """All of it but the steps and how fast they were, as plain JSON."""
         return {
             "task": self.seen.task.name,
-            "source": self.source,
+            "data": None if self.data is None else str(self.data),
             "steps": len(self.seen.before),
             "findings": to_plain([{**e._asdict(), "title": e.title} for e in self.findings]),
             "representation": self.advice.representation,
@@ -69,6 +69,11 @@ class Check(NamedTuple):
             "returns": {n: dict(zip(_RETURNS, e, strict=True)) for n, e in self.returns.items()},
             "spread": {str(repeat): far for repeat, far in self.spread.items()},
         }
+
+    @property
+    def source(self) -> str:
+        """Where the steps are from, as words that follow their number."""
+        return "played" if self.data is None else f"of {self.data}"
 
     @property
     def returns(self) -> dict[str, tuple[float | None, ...]]:
@@ -137,16 +142,16 @@ class Check(NamedTuple):
 def check_task(task: Task, steps: int, seed: int, where: Path | None = None) -> Check:
     """Play a task and check what was seen; `where` its features file is written, if it is."""
     seen, played = play(task, steps, seed)
-    return _check(seen, "played", seed, where, played, None)
+    return _check(seen, seed, where, played, None)
 
 
 def check_data(data: Dataset, steps: int, seed: int, where: Path | None = None) -> Check:
     """Check what is in a data set."""
-    return _check(read(data, steps, seed), f"of {data.folder}", seed, where, None, data.folder)
+    return _check(read(data, steps, seed), seed, where, None, data.folder)
 
 
 def _check(
-    seen: Seen, source: str, seed: int, where: Path | None, played: Played | None, data: Path | None
+    seen: Seen, seed: int, where: Path | None, played: Played | None, data: Path | None
 ) -> Check:
     known, findings = shapes(seen)
     notes, is_turned, is_symmetric = [] if played else [_NOT_PLAYED], False, False
@@ -165,7 +170,7 @@ def _check(
         findings.append(Finding("random", (), why, fix))
     findings.sort(key=lambda each: [*WORST_FIRST].index(each.kind))
     advice = advise(seen, known, findings, is_symmetric, where, data)
-    return Check(source, findings, advice, notes, seen, known, played)
+    return Check(data, findings, advice, notes, seen, known, played)
 
 
 def _by_turning(task: Task) -> tuple[list[Finding], bool]:

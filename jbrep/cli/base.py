@@ -16,7 +16,7 @@ import click
 from jbrep.cli.generator import Command, with_its_options
 from jbrep.cli.signals import leave
 from jbrep.errors import InputError, Notice
-from jbrep.text import printable, terminal_width, wrapped
+from jbrep.text import noted, printable, terminal_width, wrapped
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -48,8 +48,7 @@ def _notices() -> Iterator[None]:
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if issubclass(category, Notice):
             told = with_its_options(str(message), click.get_current_context(silent=True))
-            line = f"Note: {told}"
-            (say if os.sep in line else tell)(line, err=True)  # a path may be copied
+            say(noted(told), err=True)
         else:
             usual(message, category, *where, **options)
 

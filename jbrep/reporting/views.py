@@ -116,7 +116,6 @@ def _returns_table(name: str, groups: Sequence[Group], found: Findings, brief: b
     }
     shares = dict.fromkeys(share for g in groups for each in g.agents for share in each.shares)
     columns: Cells = {
-        "runs": lambda each: str(len(each.seeds)),
         "failed": lambda each: str(len(each.failed) or "-"),
         "final return": _number("final_return_mean", form),
         "above baselines": lambda each: each.learnt,
@@ -128,12 +127,11 @@ def _returns_table(name: str, groups: Sequence[Group], found: Findings, brief: b
             else {}
         ),
         gain: lambda each: interval(kept.get(each.representation, _UNKNOWN), ".2f"),
-        "rise in the last fifth": _number("rise", form),
+        "rise at the end": _number("rise", form),
         **{f"share of {n}": partial(_share, n) for n in shares},
     }
     if brief:
-        long = ("runs", gain, "rise in the last fifth")
-        columns = {head: cell for head, cell in columns.items() if head not in long}
+        columns = {n: cell for n, cell in columns.items() if n not in (gain, "rise at the end")}
     rows = [
         (g.algorithm if several else each.representation, *(c(each) for c in columns.values()))
         for g in groups
@@ -174,11 +172,11 @@ def verdict_cells(verdict: Verdict) -> dict[str, str]:
         "verdict": say("verdict", verdict),
         "estimate": interval(tested, SIGNIFICANT),
         "score": interval(score, ".2f"),
+        "why": verdict.reason or "-",
         "level": "-" if verdict.level is None else _level(verdict.level),
         "boundary": number(verdict.boundary, SIGNIFICANT),
         "p": probability(verdict.p),
         "units": f"{verdict.units} {'encoders' if verdict.by_encoder else 'runs'}",
-        "why": verdict.reason or "-",
     }
 
 

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
 
 from jbrep.progress import Progress
 from jbrep.records.storage import exclusive, make_folder, write_whole
@@ -231,30 +232,25 @@ def line(
             at, value, clip_on="drawstyle" in style, **how | ({"label": "_"} if final else {})
         )
         if final:
+            end = column(rows[-1:], final)
             own = {"color": look["color"], "clip_on": False}
-            axes.plot(at[-1:], column(rows[-1:], final), marker="D", ms=3, ls="none", **own)
-            _name_at_end(axes, float(at[-1]), float(column(rows[-1:], final)[0]), name, own)
+            axes.plot(at[-1:], end, marker="D", ms=3, ls="none", **own)
+            _name_at_end(axes, float(end[0]), name, look["color"])
 
     return draw
 
 
-def _name_at_end(axes: Axes, at: float, value: float, name: str, look: Mapping[str, Any]) -> None:
-    """Write the name of a line beside its end, where it hits no other's."""
-    low, high = axes.get_ylim()
-    taken = [text.get_position()[1] for text in axes.texts]
-    apart = _NAMES_APART * (high - low)
-    free = (value + sign * n * apart / 2 for n in range(40) for sign in (1, -1))
-    place = next(y for y in free if all(abs(y - other) >= apart for other in taken))
-    axes.text(
-        1.03,
-        place,
-        name.partition(" (n")[0],
-        size=6,
-        va="center",
-        color=look["color"],
-        transform=axes.get_yaxis_transform(),
-        clip_on=False,
-    )
+def _name_at_end(axes: Axes, value: float, name: str, colour: str) -> None:
+    """Write the name of a line beside its end; names keep the order of the ends, and apart."""
+    look: Any = {"size": 6, "va": "center", "color": colour, "clip_on": False}
+    transform = axes.get_yaxis_transform()
+    text = axes.text(1.03, value, name.partition(" (n")[0], transform=transform, **look)
+    text.set_gid(repr(value))
+    names = sorted(axes.texts, key=lambda each: float(each.get_gid() or 0))
+    gaps = _NAMES_APART * np.diff(axes.get_ylim()) * np.arange(len(names))
+    ends = np.array([float(each.get_gid() or 0) for each in names])
+    for each, place in zip(names, isotonic_regression(ends - gaps).x + gaps, strict=True):
+        each.set_y(place)
 
 
 def runs_and_mean(value: str, mean: str, low: str, high: str) -> Mark:
@@ -340,7 +336,8 @@ def fitting(
 def tilt(axes: Axes, _: object = None) -> None:
     """Turn the names of columns, if they are many."""
     if len(axes.get_xticks()) > 3:
-        axes.tick_params(axis="x", labelrotation=45)
+        for name in axes.get_xticklabels():
+            name.set(rotation=30, ha="right", rotation_mode="anchor")
 
 
 def legend_below(figure: Figure, grid: Iterable[Axes]) -> None:

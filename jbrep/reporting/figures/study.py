@@ -33,7 +33,8 @@ from jbrep.stats.runs import in_order
 _GROUP = ("task", "algorithm")
 _SPREAD = "SD over runs"
 _ENDS = ("value", "low", "high")
-_DASHED = " Dashed: policies that don't learn; dotted: the return that counts as solved."
+_DASHED = " Dashed: policies that don't learn"
+_DOTTED = "; dotted: the return that counts as solved"
 
 
 class _Spec(NamedTuple):
@@ -92,7 +93,10 @@ def _plot(
     if (several := len(found.algorithms)) > 1 and spec.facet == _GROUP:
         how |= {"across": min(several, 6), "title": ",\n".join}
     draw = partial(draw, lines=lines, limits=limits, **{**how, **spec.more})
-    return Plot(spec.name, spec.title, spec.caption, rows, draw)
+    caption = spec.caption
+    if drawn := {name for each in lines.values() for name in each}:
+        caption += f"{_DASHED}{_DOTTED if 'solved' in drawn else ''}."
+    return Plot(spec.name, spec.title, caption, rows, draw)
 
 
 # tables
@@ -229,7 +233,7 @@ _PLOTS = (
         "Final return and its spread",
         "Mean return at the end of training, a point for each of n runs, and their mean; beside "
         "it, the standard deviation over runs. Bars: 95 % intervals, from four runs on; a triangle "
-        f"at an edge: the interval goes beyond it.{_DASHED}",
+        "at an edge: the interval goes beyond it.",
         _final,
         runs_and_mean("value", "mean", "low", "high"),
         ("", "number"),
@@ -238,14 +242,16 @@ _PLOTS = (
         ends=("low", "high"),
         together=(*_GROUP, "number"),
         played=lambda group: {name: mean.value or 0.0 for name, mean in group.references.items()},
-        more={"title": lambda key: ", ".join(key[:2]), "across": 2, "finish": tilt},
+        more={
+            **{"title": lambda key: ", ".join(key[:2]), "across": 2, "height": 2.3},
+            "finish": tilt,
+        },
     ),
     _Spec(
         "representations",
         "Return over training by representation",
         "Return of the deterministic policy over training: mean and 10 to 90 % over n runs. The "
-        "diamond at the end is the final return of the table, from more starts than the curve has."
-        f"{_DASHED}",
+        "diamond at the end is the final return of the table, from more starts than the curve has.",
         _curves,
         line("step", "mean", "p10", "p90", final="final"),
         ("training step", "return"),
@@ -263,9 +269,12 @@ _PLOTS = (
         _differences,
         _difference,
         ("difference of final returns", ""),
-        values=("difference", "boundary"),
-        ends=("difference_low", "difference_high"),
-        more={"series": "claim", "colour": "representation", "limited": "x", "across": 1},
+        values=("difference", "difference_low", "difference_high", "boundary"),
+        ends=("tested_low", "tested_high"),
+        more={
+            **{"series": "claim", "colour": "representation", "limited": "x", "across": 1},
+            "wide": True,
+        },
     ),
     _Spec(
         "profiles",
@@ -292,7 +301,7 @@ _PLOTS = (
     _Spec(
         "every_run",
         "Every run",
-        f"Mean return of each evaluation, a line for each run.{_DASHED}",
+        "Mean return of each evaluation, a line for each run.",
         _every_run,
         line("step", "mean_return", marker="", lw=0.8, alpha=0.7, label="_"),
         ("training step", "return"),
