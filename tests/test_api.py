@@ -161,6 +161,9 @@ def test_a_project_remembers_what_it_imports(tmp_path, monkeypatch):
     (deep / ".git").rename(tmp_path / ".git")
     monkeypatch.setenv("JBREP_IMPORT", "mybots_b")
     assert imports(deep) == ("mybots_a", "mybots_b")
+    for nothing in ("[tool]\njbrep = 3", "tool = 3"):
+        (tmp_path / "pyproject.toml").write_text(nothing)
+        assert imports(deep) == ("mybots_a", "mybots_b")
     (tmp_path / "pyproject.toml").write_text("[tool.jbrep]\nimport = 7")
     told = CliRunner().invoke(main, ["env", "Pendulum-v1"])
     assert (told.exit_code, "import in [tool.jbrep]" in told.output) == (2, True)

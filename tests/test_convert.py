@@ -14,9 +14,9 @@ from small import ONE_EACH
 from torch import nn
 from torch.nn import functional
 
+from jbrep.cli.encoders import card
 from jbrep.dae import DAE
 from jbrep.encoders import ACTIVATIONS, Encoder, Layer, find, load, save
-from jbrep.encoders.card import card
 from jbrep.encoders.layers import activate
 from jbrep.encoders.onnx import export
 from jbrep.envs import describe

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -73,9 +74,10 @@ print(name, repr(dataset[0])[:11])
 """
 
 
-def test_minari_lists_it_opens_it_and_recovers_the_environment(dataset, tmp_path):
+def test_minari_lists_it_opens_it_and_recovers_the_environment(dataset, tmp_path, monkeypatch):
     """In a process that doesn't import jbrep itself; the environment repeats an episode."""
-    export(dataset, "minari", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    export(dataset, "minari", Path())
     assert "MINARI_DATASETS_PATH" not in os.environ
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", MINARI],

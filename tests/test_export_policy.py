@@ -112,6 +112,9 @@ def test_the_example_is_written_beside_the_model(run):
     assert "b_loop.py" in jbrep("policy", "export", run, "--out", model, "--with-example").output
     loop = model.with_name("b_loop.py")
     assert loop.read_bytes() == EXAMPLE.read_bytes()
-    loop.unlink()
-    again = jbrep("policy", "export", run, "--out", model, "--with-example")
-    assert (again.exit_code, loop.exists()) == (2, False)
+    for there, other in ((loop, model), (model, loop)):  # neither is written where one is there
+        other.unlink(missing_ok=True)
+        there.touch()
+        again = jbrep("policy", "export", run, "--out", model, "--with-example")
+        assert (again.exit_code, other.exists()) == (2, False)
+        there.unlink()

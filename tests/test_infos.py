@@ -123,7 +123,7 @@ def study(tmp_path_factory):
 def test_a_study_has_them_in_a_table_of_its_own(study, tmp_path):
     folder, _ = study
     tables = read_tables(folder)
-    assert tables.infos == [
+    assert tables.raw.infos == [
         RunInfo(SCORED, "a2c-paper", "full", seed, step, episode, *each)
         for seed in (0, 1)
         for step, episodes in ((0, 1), (40, EPISODES))
@@ -148,7 +148,7 @@ def test_reports_have_a_column_for_each_share(study):
 def test_shares_are_of_last_evaluations_and_have_intervals(study):
     """A run that failed has none; four or more runs have an interval."""
     tables = read_tables(study[0])
-    first, *_ = tables.record.runs
+    first, *_ = tables.raw.record.runs
     made = [first.replace(seed=seed) for seed in range(5)]
     made[4] = first.replace(seed=4, status="failed", reason="of heat")
     key = (SCORED, "a2c-paper", "full")
@@ -160,8 +160,9 @@ def test_shares_are_of_last_evaluations_and_have_intervals(study):
         for episode in range(5)
     ]
     infos.append(RunInfo(*key, 3, 40, 0, "heat", 0.5))
-    tables = tables._replace(record=tables.record.replace(runs=made), returns=returns, infos=infos)
-    found = Findings.of(tables)
+    record = tables.raw.record.replace(runs=made)
+    raw = tables.raw._replace(record=record, returns=returns, infos=infos)
+    found = Findings.of(tables._replace(raw=raw))
     assert {run.seed: run.shares for run in found.runs} == {
         seed: {"won": (seed + 1) / 5} if seed < 4 else {} for seed in range(5)
     }

@@ -174,7 +174,7 @@ def test_verdicts_are_the_same_wherever_they_are_told(judged, tmp_path):
     assert [each.verdict for each in found.verdicts] == [each.verdict for each in verdicts]
     assert {each.verdict for each in found.verdicts} == {"supported", "undecided"}
     (table,) = verdict_tables(found)
-    assert [row[0] for row in table.rows] == [*tables.record.study.verdicts.claims]
+    assert [row[0] for row in table.rows] == [*tables.raw.record.study.verdicts.claims]
     section = html.unescape(page.read_text()).partition('<section id="verdicts">')[2]
     section = section.partition("</section>")[0]
     for row in table.rows:

@@ -11,7 +11,6 @@ from scipy import optimize, stats
 from jbrep.errors import InputError
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.analysis import aggregates, probability_of_improvement, to_plain
-from jbrep.stats.association import rank_correlation
 from jbrep.stats.curves import (
     bands,
     common_grid,
@@ -28,6 +27,7 @@ from jbrep.stats.intervals import (
     deviation,
     mean_within,
     percentile,
+    rank_correlation,
     share_of_gain,
     variance_ratio,
 )

@@ -11,7 +11,7 @@ from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.methods.registry import METHODS
-from jbrep.stats.association import rank_correlation
+from jbrep.stats.intervals import rank_correlation
 from jbrep.training.method import Learned
 
 ROOT = Path(__file__).parent.parent

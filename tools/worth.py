@@ -30,8 +30,8 @@ from jbrep.evaluation.table import headline
 from jbrep.records.document import read_document
 from jbrep.reporting.evaluation import AS_GOOD, judge
 from jbrep.reporting.tables import Tables, read_tables
-from jbrep.stats.association import correlation_of_ranks, over_families
 from jbrep.stats.bootstrap import Array, Interval
+from jbrep.stats.intervals import correlation_of_ranks, over_families
 from jbrep.studies.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, interval, number
 
@@ -76,9 +76,8 @@ def read(folder: Path) -> Scored:
     tables = read_tables(folder)
     evaluation = read_document(folder / SCORES / EVALUATION, Evaluation)
     check(evaluation, tables)
-    kinds = {
-        each.settings.representation: each.encoder.kind for each in tables.record.labels.values()
-    }
+    labels = tables.raw.record.labels.values()
+    kinds = {each.settings.representation: each.encoder.kind for each in labels}
     codes = [code for code in kinds if code != FULL]
     finals, short, whole = returned(tables, codes)
     others = (finals.sum(1, keepdims=True) - finals) / (finals.shape[1] - 1)
@@ -126,13 +125,13 @@ def returned(tables: Tables, codes: Sequence[str]) -> tuple[Array, Array, Array]
         InputError: runs are missing, or no run is longer than a short one.
     """
     analysis = tables.analysis
-    if analysis is None or len(analysis.groups) != 1 or tables.record.missing:
+    if analysis is None or len(analysis.groups) != 1 or tables.raw.record.missing:
         raise InputError(f"{tables.name} lacks runs of one task: run the study to its end")
     (group,) = analysis.groups
     if not (later := [int(step) for step in group.grid if step >= SHORT_STEPS]):
         raise InputError(f"{tables.name} has runs of fewer than {SHORT_STEPS:,} steps")
     labels = {each.representation: each for each in group.labels}
-    evaluated = by_run(tables.returns)
+    evaluated = by_run(tables.raw.returns)
 
     def means(step: int) -> Array:
         of_runs = [
@@ -155,8 +154,8 @@ def check(evaluation: Evaluation, tables: Tables) -> None:
     Raises:
         InputError: on others.
     """
-    for run in tables.record.runs:
-        code = tables.record.labels[run.label].settings.representation
+    for run in tables.raw.record.runs:
+        code = tables.raw.record.labels[run.label].settings.representation
         if code != FULL and evaluation.hashes.get(code) != run.encoder:
             raise InputError(f"{run.label}: agents trained on another code than the one scored")
 

@@ -11,16 +11,18 @@ from jbrep.cli.base import command, say, say_json, tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
 from jbrep.parameters import AsJson, NeededTask, OptionalTask, TaskName
-from jbrep.text import r2_text, slug, table, terminal_width
+from jbrep.text import facts, r2_text, slug, table, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.encoders import Encoder
     from jbrep.encoders.base import BaseEncoder
+    from jbrep.encoders.encoder import Layers
     from jbrep.envs.task import Task
     from jbrep.evaluation.evaluation import Evaluation
     from jbrep.evaluation.table import Values
 
 
+_RECORDS = ("training", "data", "metrics", "versions")
 _LETTERS = 100  # of the name of a folder
 _Which = Annotated[str, Meta(extra={"is_code": True, "option": "encoder"})]
 
@@ -142,12 +144,11 @@ def info(encoder: _Which, /, *, task: OptionalTask = None, as_json: AsJson = Fal
     ENCODER is a file, or, given its --task, the name of one that ships, or code such as
     mymodule:MyEncoder, whose module is imported: this runs it.
     """
-    from jbrep.encoders.card import card, describe
     from jbrep.encoders.shipped import find_alone, source_of
 
     shown, source = find_alone(encoder, task), source_of(encoder, task)
     if as_json:
-        return say_json(describe(shown, source))
+        return say_json(described(shown, source))
     return say(card(shown, source, terminal_width()))
 
 
@@ -190,7 +191,6 @@ def import_model(
         decoder: a model from latents back to observations, if MODEL has no reconstruction.
         name: what tables will call it; by default the name of the file.
     """
-    from jbrep.encoders.card import card
     from jbrep.encoders.encoder import SUFFIX, Encoder, save_new
     from jbrep.records.storage import exists, taken
 
@@ -199,3 +199,65 @@ def import_model(
     made = Encoder.from_onnx(model, task, decoder, name or out.name.removesuffix(SUFFIX))
     save_new(made, out)
     say(card(made, str(out), terminal_width()))
+
+
+def described(encoder: "BaseEncoder", source: str) -> dict[str, Any]:
+    """An encoder's card as plain JSON, with its source, as `source_of` says it."""
+    from jbrep.encoders import Encoder
+
+    task = encoder.task
+    told = {
+        "name": encoder.name,
+        "source": source,
+        "task": task.name,
+        "environment": task.id,
+        "arguments": dict(task.arguments),
+        "kind": encoder.kind,
+        "size": encoder.size,
+        "latent_size": encoder.latent_size,
+    }
+    if not isinstance(encoder, Encoder):
+        return {**told, "decodes": encoder.can_decode, "sha256": encoder.fingerprint}
+    features = encoder.scaler.features(encoder.task)
+    ranges = zip(features, encoder.scaler.low, encoder.scaler.high, strict=True)
+    return {
+        **told,
+        "encoder": _layers(encoder.encoder),
+        "decoder": _layers(encoder.decoder),
+        **{name: getattr(encoder.header, name) for name in _RECORDS},
+        "sha256": encoder.fingerprint,
+        "features": [
+            {"name": feature.name, "unit": feature.unit, "low": float(low), "high": float(high)}
+            for feature, low, high in ranges
+        ],
+    }
+
+
+def card(encoder: "BaseEncoder", source: str, width: int) -> str:
+    """The same in lines; of a file, also the range of each feature, scaled to [-1, 1]."""
+    told = described(encoder, source)
+    features = told.pop("features", ())
+    for part in ("encoder", "decoder"):
+        if part in told:
+            layers = (f"{layer['units']} {layer['activation']}" for layer in told[part])
+            told[part] = " -> ".join(layers) or "none"
+    named = {name: _said(value) for name, value in told.items() if value not in ({}, encoder.name)}
+    text = f"{encoder.name}\n{facts(named, width)}"
+    rows = [(f["name"], f["unit"], f"{f['low']:.4g}", f"{f['high']:.4g}") for f in features]
+    return f"{text}\n\n{table(('feature', 'unit', 'low', 'high'), rows)}" if rows else text
+
+
+def _layers(layers: "Layers") -> list[dict[str, Any]]:
+    return [{"units": layer.units, "activation": layer.activation} for layer in layers]
+
+
+def _said(value: Any) -> str:
+    """As latent 8, policy (kind uniform)."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if not isinstance(value, Mapping):
+        return str(value)
+    parts = (
+        f"{n} ({_said(v)})" if isinstance(v, Mapping) else f"{n} {v}" for n, v in value.items()
+    )
+    return ", ".join(parts)

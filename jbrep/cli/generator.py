@@ -13,6 +13,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import UnionType
@@ -324,8 +325,10 @@ def _project_modules(here: Path) -> list[str]:
         if (file := folder / "pyproject.toml").is_file():
             from jbrep.records.document import read_toml
 
-            own = read_toml(file).get("tool", {}).get("jbrep", {})
-            if modules := own.get("import"):
+            modules = None
+            with suppress(LookupError, TypeError):  # it has no such table
+                modules = read_toml(file)["tool"]["jbrep"]["import"]
+            if modules:
                 sys.path.append(str(folder))
                 return converted(modules, list[str], f"import in [tool.jbrep] of {file}")
     return []

@@ -61,7 +61,7 @@ def export(
     from jbrep.envs.description import describe
     from jbrep.envs.names import modules_of, spec_of
     from jbrep.play.sources import policy_file
-    from jbrep.records.storage import write_new
+    from jbrep.records.storage import exists, taken, write_new
     from jbrep.rl.controller import EXAMPLE, described, load_policy
     from jbrep.rl.controller import export as write
     from jbrep.rl.policy_file import SHIPPED
@@ -73,6 +73,8 @@ def export(
         )
     controller = load_policy(policy_file(policy, describe(task) if task else None))
     loop = out.with_name(f"{out.stem}_loop.py")
+    if with_example and exists(loop):
+        raise taken(loop)
     write(controller, out)
     if with_example:
         write_new(loop, EXAMPLE.read_bytes())
@@ -156,7 +158,7 @@ def evaluate_policy(
         failure = str(error)
     _show_returns(policy, player, source, returns, numbers, as_json)
     if beside and not failure:
-        _compare(beside, player, returns, (episodes, threads, retries))
+        _compare(beside, player, returns, (episodes, threads, retries), err=as_json)
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
     return bool(failure)
@@ -196,7 +198,11 @@ def _show_returns(
 
 
 def _compare(
-    other: str, player: "Player", returns: list[float], how: tuple[int, int | None, int]
+    other: str,
+    player: "Player",
+    returns: list[float],
+    how: tuple[int, int | None, int],
+    err: bool,
 ) -> None:
     """Show what another policy returns in the same episodes."""
     from jbrep.play.sources import find_player
@@ -205,7 +211,7 @@ def _compare(
     theirs = beside.returns(*how)
     apart = max(abs(own - its) for own, its in zip(returns, theirs.tolist(), strict=True))
     told = f"{beside.name}: {interval_of(theirs)}; no episode's return differs by more than"
-    tell(f"{told} {apart:.3g}")
+    tell(f"{told} {apart:.3g}", err=err)
 
 
 def _perturb(

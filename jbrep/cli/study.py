@@ -66,7 +66,7 @@ def study(
     with stoppable(RESUMES):
         made = api.study(study, folder, workers=workers, backend=backend)
     _show(made)
-    return bool(made.tables.record.missing)
+    return bool(made.tables.raw.record.missing)
 
 
 def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> None:

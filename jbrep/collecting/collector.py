@@ -124,15 +124,16 @@ def _fill(growth: Growth, produce: Produce, name: str) -> Manifest:
 def _begin(wanted: Manifest, folder: Path, files: Mapping[str, bytes]) -> Manifest:
     """The manifest to go on from: what is there, or what is wanted, without shards."""
     settings, there = wanted.settings, wanted
-    if exists(folder / MANIFEST):
-        there = read_manifest(folder)
+    begun = read_manifest(folder) if exists(folder / MANIFEST) else None
+    if begun and begun.shards:
+        there = begun
         _check_same(there, wanted, folder)
         check_sizes(folder, there)
-    elif exists(shard_path(folder, 0)):
+    elif begun is None and exists(shard_path(folder, 0)):
         raise InputError(f"{folder} has shards but no {MANIFEST}: choose another folder")
     check_space(folder, (settings.steps - there.rows) * settings.row_bytes())
     for name, content in files.items():
-        if not exists(folder / name):
+        if there is wanted or not exists(folder / name):
             write_whole(folder / name, content)
         elif (folder / name).read_bytes() != content:
             raise InputError(f"{folder / name} is another policy's file: choose another folder")

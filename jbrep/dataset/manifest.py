@@ -180,9 +180,14 @@ def open_shard(folder: Path, manifest: Manifest, shard: int, *, known: bool = Fa
     if not known and hashlib.sha256(content).hexdigest() != entry.sha256:
         raise DamageError(f"{path} is damaged: its SHA-256 isn't the manifest's; {AGAIN}")
     columns = dict[str, NDArray[Any]]()
-    for name, spec in manifest.settings.specs().items():
-        shape = (entry.episodes if name.startswith(EPISODES) else entry.rows, *spec.row)
-        columns[name] = np.ndarray(shape, spec.dtype, content, entry.offsets[name])
+    errors = (LookupError, TypeError, ValueError)
+    with refusing(f"{path} is damaged: a column isn't in it", errors, kind=DamageError):
+        for name, spec in manifest.settings.specs().items():
+            shape = (entry.episodes if name.startswith(EPISODES) else entry.rows, *spec.row)
+            columns[name] = np.ndarray(shape, spec.dtype, content, entry.offsets[name])
+    lengths = columns[EPISODES + "length"]
+    if (lengths < 1).any() or lengths.sum() != entry.rows:
+        raise DamageError(f"{path} is damaged: its episodes aren't as long as it has rows; {AGAIN}")
     return columns
 
 
@@ -227,9 +232,13 @@ def find_problems(folder: Path) -> Iterator[str]:
         yield str(damage)
     for shard in Progress(range(len(manifest.shards)), unit="shard", desc="verify", leave=False):
         try:
-            open_shard(folder, manifest, shard)
+            columns = open_shard(folder, manifest, shard)
         except DamageError as damage:
             yield str(damage)
+            continue
+        if not manifest.settings.is_imported:  # which tells of its own
+            told = range_problems(manifest.settings.task, columns)
+            yield from (f"{shard_path(folder, shard)}: {each}" for each in told)
 
 
 def policy_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:

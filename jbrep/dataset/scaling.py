@@ -114,10 +114,6 @@ def fit_scaler(
     return Scaler(low.astype(np.float32), high.astype(np.float32), coordinates, clip)
 
 
-def _extrema(features: Features, parts: Parts, rows: Rows) -> Range:
-    return extrema(parts(rows))
-
-
 def extrema(parts: Iterable[NDArray[Any]]) -> Range:
     """Least and greatest values of rows (n, d) in parts, (d,) each."""
     ends = [(values.min(axis=0), values.max(axis=0)) for values in parts]
@@ -169,7 +165,7 @@ def _robust(features: Features, parts: Parts, rows: Rows) -> Range:
 
 
 SCALINGS: dict[str, Callable[[Features, Parts, Rows], Range]] = {
-    EXTREMA: _extrema,  # minimum and maximum
+    EXTREMA: lambda features, parts, rows: extrema(parts(rows)),
     NOMINAL: _nominal,  # the task's usual ranges
     "standard": _standard,  # the mean, and three standard deviations to either side
     "robust": _robust,  # the median, and half the distance from the 1 % to the 99 % quantile

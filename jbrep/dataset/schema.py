@@ -9,9 +9,17 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
-from jbrep.dataset.settings import IMPORTED, MAX_LETTERS, MIXTURE, CollectSettings, PolicySettings
+from jbrep.dataset.settings import (
+    IMPORTED,
+    MAX_LETTERS,
+    MIXTURE,
+    TRAINED,
+    CollectSettings,
+    PolicySettings,
+    parts_of,
+)
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, refusing
 from jbrep.records.record import pattern, to_plain
 
 Columns = Mapping[str, NDArray[Any]]
@@ -52,6 +60,10 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
     reward: _Code | UnsetType = UNSET  # what has given the rewards, if not the environment
 
     def check(self) -> None:
+        told = {TRAINED: ("file", "sha256", "run", "step")}
+        with refusing("a policy lacks what is said of each", (LookupError, TypeError, ValueError)):
+            for each in parts_of(self.policy):
+                _ = [each[key] for key in told.get(each["kind"], ())]
         self.specs()
         episode_seed(self.task, self.seed, (self.steps - 1) // self.task.max_episode_steps)
         if self.store_state and not self.task.state:

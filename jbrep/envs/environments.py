@@ -332,11 +332,13 @@ class Separate:
         self._reward, self.lost = np.zeros(len(chosen)), np.zeros(len(chosen), np.bool_)
         single = actions.astype(np.float32)
         terminated, truncated = np.zeros((2, len(chosen)), np.bool_)
-        with aside(in_episode=True), in_time():
+        with aside(in_episode=True):
             for index in np.flatnonzero(chosen).tolist():
                 self._steps[index] += 1
                 try:
-                    terminated[index], truncated[index] = self._step(index, single[index])
+                    with in_time():
+                        ends = self._step(index, single[index])
+                    terminated[index], truncated[index] = ends
                 except _MissingError:
                     self._lose(index)
                 except OURS:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.envs.task import Array, Task, View
+from jbrep.envs.task import MAX_FEATURES, Array, Task, View
 from jbrep.errors import InputError, matching
 
 
@@ -29,6 +29,10 @@ def with_view(task: Task, hidden: Iterable[str] = (), history: int = 1) -> Task:
     if not view.hidden and history == 1:
         return task
     seen = view.seen(task.action_low, task.action_high)
+    if len(seen) > MAX_FEATURES:
+        raise InputError(
+            f"a history of {history} has {len(seen):,} numbers: {MAX_FEATURES:,} may be"
+        )
     return task.replace(name=f"{task.name}{view.suffix}", features=seen, view=view)
 
 

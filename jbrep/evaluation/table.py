@@ -39,15 +39,12 @@ def diagnostics_text(rows: Sequence[Diagnosed]) -> str:
 
 def read_diagnostics(path: Path, sha256: str | None = None) -> list[Diagnosed]:
     """The rows of the table, with whatever numbers it has."""
-    return [Diagnosed(*row) for row in read_csv(path, _KEY, sha256, further=_value)]
+    rows = read_csv(path, _KEY, sha256, further=lambda cell: finite(cell) if cell else None)
+    return [Diagnosed(*row) for row in rows]
 
 
 def _cell(value: float | None) -> str:
     return "" if value is None else f"{value:.6g}"
-
-
-def _value(cell: str) -> float | None:
-    return finite(cell) if cell else None
 
 
 def by_label(rows: Iterable[Diagnosed]) -> dict[tuple[str, str], dict[str, float | None]]:

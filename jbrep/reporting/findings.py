@@ -19,8 +19,7 @@ from jbrep.records.record import to_plain as record_to_plain
 from jbrep.reporting.tables import Tables
 from jbrep.rl.files import FAILED
 from jbrep.stats.analysis import Analysis, GroupAnalysis, to_plain
-from jbrep.stats.association import rank_correlation
-from jbrep.stats.intervals import LEVEL, Bounds, mean_within, unless_few
+from jbrep.stats.intervals import LEVEL, Bounds, mean_within, rank_correlation, unless_few
 from jbrep.stats.labels import YES
 from jbrep.stats.runs import in_order
 from jbrep.stats.scale import SOLVED
@@ -212,7 +211,7 @@ class Findings(Document, frozen=True, kw_only=True):
     @classmethod
     def of(cls, tables: Tables) -> "Findings":
         """What the tables of a study say."""
-        record, analysis, runs = tables.record, tables.analysis, _runs(tables)
+        record, analysis, runs = tables.raw.record, tables.analysis, _runs(tables)
         labels, planned = record.labels, record.planned
         settings = [label.settings for label in labels.values()]
         own = (each.representation for each in settings if each.encoder == EACH_ITS_OWN)
@@ -234,7 +233,7 @@ class Findings(Document, frozen=True, kw_only=True):
             scaling=_scaling([*labels.values()]),
             missing=record.missing,
             left_out=tables.left_out,
-            not_played=sorted({*record.tasks} - {*tables.references}),
+            not_played=sorted({*record.tasks} - {*tables.raw.references}),
             verdicts=to_plain(analysis.verdicts) if analysis else [],
             groups=groups_of(analysis, runs, _in_training(tables)) if analysis else [],
             aggregates=to_plain(analysis.aggregates) if analysis else [],
@@ -299,16 +298,16 @@ def _mean_share(values: Sequence[float]) -> list[Any]:
 
 def _runs(tables: Tables) -> list[RunFound]:
     """Every run, with its curve; as shares, numbers that are 0 or 1 in all episodes of a task."""
-    returns = by_run(tables.returns)
+    returns = by_run(tables.raw.returns)
     told = dict[tuple[str, int], dict[str, list[float]]]()
     of_task = dict[str, dict[str, list[float]]]()
-    for row in tables.infos:  # of last evaluations
+    for row in tables.raw.infos:  # of last evaluations
         if row.step == max(returns.get(run_of(row), ()), default=None):
             told.setdefault(run_of(row), {}).setdefault(row.name, []).append(row.value)
             of_task.setdefault(row.task, {}).setdefault(row.name, []).append(row.value)
     known = {task: shares(values) for task, values in of_task.items()}
     found = []
-    for run in tables.record.runs:
+    for run in tables.raw.record.runs:
         of_run = returns.get((run.label, run.seed), {})
         fewest = min(map(len, of_run.values()), default=0)  # the last evaluation may have more
         own = {} if run.status == FAILED else told.get((run.label, run.seed), {})
@@ -332,12 +331,12 @@ def _in_training(tables: Tables) -> dict[str, dict[str, float]]:
     Where only the last evaluation has all starts, curves of the others can't stand beside them.
     """
     fewest: dict[str, int] = {}
-    for (label, _), by_step in by_run(tables.returns).items():
+    for (label, _), by_step in by_run(tables.raw.returns).items():
         task, count = label.rsplit("/", 2)[0], min(map(len, by_step.values()))
         fewest[task] = min(fewest.get(task, count), count)
     return {
         task: {policy: float(np.mean(each)) for policy, each in played.items()}
-        for task, played in tables.references.items()
+        for task, played in tables.raw.references.items()
         if all(len(each) == fewest.get(task) for each in played.values())
     }
 
@@ -345,7 +344,7 @@ def _in_training(tables: Tables) -> dict[str, dict[str, float]]:
 def _diagnosed(tables: Tables, analysis: Analysis) -> Iterator[Diagnosed]:
     """Each registered diagnostic that is known of some code, with final returns."""
     families = {}
-    for label in tables.record.labels.values():
+    for label in tables.raw.record.labels.values():
         name, kind = label.settings.representation, label.encoder.kind
         families[label.settings.task, name] = name if kind == OWN else kind
     for group in analysis.groups:
@@ -409,12 +408,12 @@ def _encoder(shared: Label) -> dict[str, Any]:
 
 def _settings(tables: Tables) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
-    for shared in tables.record.labels.values():
+    for shared in tables.raw.record.labels.values():
         settings, task = record_to_plain(shared.settings), shared.settings.environment
         settings["environment"]["domain"] = str(task.domain or "") or None
         settings["environment"]["features"] = [feature.name for feature in task.features]
         every = dict(_flat(settings))
-        for name, values in tables.record.draws_of(shared.settings.learner).items():
+        for name, values in tables.raw.record.draws_of(shared.settings.learner).items():
             every[name] = f"one of {', '.join(map(str, values))}, by seed"
         shown = {name: value for name, value in every.items() if name not in _NOT_SHOWN}
         found.setdefault(f"{shared.settings.task}/{shared.settings.learner}", shown)
@@ -424,10 +423,10 @@ def _settings(tables: Tables) -> dict[str, dict[str, Any]]:
 def _title(tables: Tables) -> str:
     """What was studied, where its file has no title."""
     seen = in_order(
-        (label.settings.representation for label in tables.record.labels.values()), FULL
+        (label.settings.representation for label in tables.raw.record.labels.values()), FULL
     )
     shown = ", ".join(seen) if len(seen) <= _MOST_NAMED else f"{len(seen)} representations"
-    return f"{', '.join(tables.record.tasks)}: {shown}"
+    return f"{', '.join(tables.raw.record.tasks)}: {shown}"
 
 
 def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -436,7 +435,7 @@ def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _imports(tables: Tables) -> list[str]:
-    record = tables.record
+    record = tables.raw.record
     own = record.study.representations if record.study else ()
     codes = [each["code"] for each in own if isinstance(each, Mapping) and "code" in each]
     modules = (str(code).partition(":")[0] for code in codes)

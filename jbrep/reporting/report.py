@@ -46,7 +46,7 @@ class Report(NamedTuple):
     @property
     def returns(self) -> list[Return]:
         """The return of every episode of every evaluation: rows for a data frame."""
-        return self.tables.returns
+        return self.tables.raw.returns
 
     def __repr__(self) -> str:
         return f"{results_text(self.findings, terminal_width())}\n\n{self.page}"

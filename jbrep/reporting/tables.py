@@ -14,17 +14,14 @@ from jbrep.stats.runs import groups
 from jbrep.stats.scale import BLIND
 from jbrep.studies import tables as study
 from jbrep.studies.record import RunsRecord
-from jbrep.studies.tables import References, Return, RunInfo
+from jbrep.studies.tables import References
 
 
 class Tables(NamedTuple):
     """The tables of a study, and what the statistics say of them."""
 
     name: str
-    record: RunsRecord  # runs.json
-    returns: list[Return]  # returns.csv
-    infos: list[RunInfo]  # run-infos.csv
-    references: References  # references.csv: returns by task and policy
+    raw: study.Tables  # as they were read
     # diagnostics.csv: values by task and representation, then by name
     diagnostics: dict[tuple[str, str], dict[str, float | None]]
     analysis: Analysis | None  # None where runs allow no statistics
@@ -36,7 +33,7 @@ def read_tables(folder: Path) -> Tables:
     tables = study.read_tables(folder)
     name = folder.resolve().name.encode(errors="replace").decode()
     diagnostics = by_label(read_known(folder, tables.record))
-    return Tables(name, *tables, diagnostics, *_statistics(tables))
+    return Tables(name, tables, diagnostics, *_statistics(tables))
 
 
 def _statistics(tables: study.Tables) -> tuple[Analysis | None, list[str]]:

@@ -30,7 +30,7 @@ from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.environments import Environments
 from jbrep.envs.recording import Actor, Outcome, held, joined, whole_outcome
 from jbrep.envs.task import Array, Task
-from jbrep.errors import Notice
+from jbrep.errors import Notice, refusing
 from jbrep.records.container import Tensors
 from jbrep.records.record import to_plain
 from jbrep.rl.files import EVALUATION_SEED
@@ -110,7 +110,10 @@ def make_agent(
     if hyperparameters.noise:
         size = int(np.prod(env.action_space.shape or (), dtype=int))
         of_class["action_noise"] = noise_of(hyperparameters.noise, size, episode_steps)
-    with warnings.catch_warnings(record=True) as told:
+    with (
+        warnings.catch_warnings(record=True) as told,
+        refusing("there is no room for the agent and its buffer", (MemoryError,), told=one_line),
+    ):
         agent: Any = sb3_class(algorithm)(
             "MlpPolicy",
             env,
@@ -271,7 +274,8 @@ def statistics_of(agent: BaseAlgorithm) -> Statistics | None:
 def restore_statistics(agent: BaseAlgorithm, tensors: Tensors) -> None:
     """Let an agent that normalises go on from the statistics among tensors."""
     if env := agent.get_vec_normalize_env():
-        Statistics.read(tensors).give(env)
+        (size,) = env.observation_space.shape or ()
+        Statistics.read(tensors, size).give(env)
 
 
 def evaluate(

@@ -268,7 +268,7 @@ def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
     encoder.check_task(settings.environment)
     normalized = settings.hyperparameters.normalize
     with refusing(f"{file.path} doesn't fit the run's settings", (LookupError, ValueError)):
-        statistics = Statistics.read(file.tensors) if normalized else None
+        statistics = Statistics.read(file.tensors, encoder.latent_size) if normalized else None
         return Controller(settings, encoder, weights, statistics)
 
 

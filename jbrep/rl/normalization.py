@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.envs.task import Array
+from jbrep.errors import InputError
 
 if TYPE_CHECKING:
     from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -27,8 +28,6 @@ class Statistics:
     mean: Array  # (size,)
     variance: Array  # (size,)
     count: float  # of observations
-    clip: float = CLIP  # the limit of what is normalised, in standard deviations
-    epsilon: float = _EPSILON  # added to the variance
 
     @classmethod
     def untrained(cls, size: int) -> "Statistics":
@@ -45,10 +44,13 @@ class Statistics:
         return cls(running.mean, running.var, float(running.count))
 
     @classmethod
-    def read(cls, tensors: Mapping[str, NDArray[Any]]) -> "Statistics":
+    def read(cls, tensors: Mapping[str, NDArray[Any]], size: int) -> "Statistics":
         """Those that `tensors` gave, among others."""
-        mean, variance, count = (tensors[_PREFIX + name] for name in _KEPT)
-        return cls(mean, variance, float(count))
+        mean, variance, count = (tensors.get(_PREFIX + name, np.array(())) for name in _KEPT)
+        fits = mean.shape == variance.shape == (size,) and count.size == 1
+        if not (fits and np.isfinite([mean, variance]).all() and (variance >= 0).all()):
+            raise InputError(f"its statistics aren't a mean and variance of {size} numbers")
+        return cls(mean, variance, float(count.item()))
 
     @property
     def tensors(self) -> dict[str, NDArray[Any]]:
@@ -63,8 +65,8 @@ class Statistics:
 
     def __call__(self, seen: NDArray[np.float32]) -> NDArray[np.float32]:
         """What an agent sees, (n, size), normalised as in training."""
-        scaled = (seen - self.mean) / np.sqrt(self.variance + self.epsilon)
-        return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
+        scaled = (seen - self.mean) / np.sqrt(self.variance + _EPSILON)
+        return np.clip(scaled, -CLIP, CLIP).astype(np.float32)
 
     def give(self, env: "VecNormalize") -> None:
         """Let an environment continue from them."""

@@ -74,6 +74,7 @@ _REFUSED = {  # arguments that are jbrep's own, with the reason
         ("use_sde", "sde_sample_freq", "use_sde_at_warmup"), "a checkpoint has no noise on features"
     ),
 }
+_QUANTILES = 25  # of each of TQC's critics, by default
 _NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "net_arch"}
 
 
@@ -117,6 +118,8 @@ def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> 
         return before.replace(policy_kwargs={**before.policy_kwargs, name: checked})
     if name == "optimizer_kwargs" and isinstance(value, dict):
         value = {**before.optimizer_kwargs, **value}
+    if name == "warm_up":
+        before = before.learning_from(argument(algorithm, before, "learning_starts"))
     after = before.replace(**{name: _or_none(value)})
     _check_parts(algorithm, after.net_arch)
     return after
@@ -124,7 +127,7 @@ def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> 
 
 def setting_names(algorithm: str) -> list[str]:
     """What can be set of an algorithm."""
-    own = _OWN if ALGORITHMS[algorithm].learns_off_policy else _OWN - {"noise"}
+    own = _OWN if ALGORITHMS[algorithm].learns_off_policy else _OWN - {"noise", "warm_up"}
     return sorted({*_parameters(algorithm), *_policy_parameters(algorithm), *own})
 
 
@@ -223,6 +226,12 @@ def _check_together(algorithm: str, chosen: Hyperparameters) -> None:
         raise InputError(
             "gradient_steps is 0, with which nothing is learned: it must be above, or -1 for as "
             "many as there were steps"
+        )
+    dropped, of = given("top_quantiles_to_drop_per_net"), chosen.policy_kwargs.get("n_quantiles")
+    if dropped is not None and dropped >= (of or _QUANTILES):
+        raise InputError(
+            f"top_quantiles_to_drop_per_net is {dropped}: of {of or _QUANTILES} quantiles one must "
+            "be left"
         )
 
 

@@ -99,7 +99,7 @@ class Trained(NamedTuple):
         fill(acting(self.policy), weights, source)
         if self.statistics is None:
             return self
-        return self._replace(statistics=Statistics.read(tensors))
+        return self._replace(statistics=Statistics.read(tensors, self.encoder.latent_size))
 
 
 def _finite(act: Actor) -> Actor:

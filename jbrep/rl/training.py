@@ -1,6 +1,9 @@
 """One run in its folder: trained by stable-baselines3, from its start or from its checkpoint."""
 
 import hashlib
+import io
+import json
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -10,9 +13,12 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
+import safetensors.numpy
+import stable_baselines3
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.save_util import data_to_json
 
 from jbrep.encoders import Encoder, save
 from jbrep.encoders.base import BaseEncoder
@@ -63,13 +69,27 @@ from jbrep.rl.files import (
 from jbrep.rl.history import ControlStepsLogger, History, Scalars
 from jbrep.rl.policy import Trained, fill_whole, pack_whole
 from jbrep.rl.policy_file import read
-from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
 from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_LINE
 from jbrep.text import printable
 from jbrep.training.trainer import single_thread
 
+_STATISTICS = "observation_statistics.safetensors"  # by which an agent normalises what it sees
+_OF_TRAINING = {
+    "action_noise",  # which may be jbrep's own
+    "replay_buffer_class",  # `load` finds the one for n_steps, and warns of one that is given
+}
+_OF_THIS_PROCESS = {  # wall times, and where the environment was: `load` starts with defaults
+    "_last_episode_starts",
+    "_current_progress_remaining",
+    "_last_obs",
+    "_last_original_obs",
+    "_num_timesteps_at_start",
+    "ep_info_buffer",
+    "ep_success_buffer",
+    "start_time",
+}
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 
 
@@ -375,3 +395,44 @@ def write_tables(folder: Path, history: History) -> dict[str, str]:
     if history.infos:
         tables[INFOS] = write_csv(folder / INFOS, Info._fields, history.infos)
     return tables
+
+
+def policy_zip(agent: BaseAlgorithm) -> bytes:
+    """A zip file that the algorithm's `load` takes, as its `save` writes it.
+
+    Unlike there, members carry a fixed date, whatever the clock says, and nothing in them depends
+    on the process or the machine. Statistics by which the agent normalises what it observes are a
+    member that `load` leaves alone.
+    """
+    names, variables = agent._get_torch_save_params()
+    left_out = {*agent._excluded_save_params(), *_OF_THIS_PROCESS, *_OF_TRAINING}
+    left_out |= {name.partition(".")[0] for name in (*names, *variables)}
+    data = {name: value for name, value in vars(agent).items() if name not in left_out}
+    statistics = statistics_of(agent)
+    members: dict[str, str | bytes] = {
+        "data": _to_json(data),
+        "pytorch_variables.pth": _to_bytes({name: getattr(agent, name) for name in variables}),
+        **{f"{name}.pth": _to_bytes(state) for name, state in agent.get_parameters().items()},
+        "_stable_baselines3_version": stable_baselines3.__version__,
+        **({_STATISTICS: safetensors.numpy.save(statistics.tensors)} if statistics else {}),
+    }
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as file:
+        for name, member in members.items():
+            file.writestr(zipfile.ZipInfo(name), member)  # dated 1980, the format's first year
+    return content.getvalue()
+
+
+def _to_json(data: dict[str, Any]) -> str:
+    """stable-baselines3's JSON without its notes for human readers, which hold addresses."""
+    stated = json.loads(data_to_json(data))
+    for name, value in stated.items():
+        if isinstance(value, dict) and ":serialized:" in value:
+            stated[name] = {key: value[key] for key in (":type:", ":serialized:")}
+    return json.dumps(stated, indent=4)
+
+
+def _to_bytes(tensors: dict[str, Any]) -> bytes:
+    content = io.BytesIO()
+    torch.save(tensors, content)
+    return content.getvalue()

@@ -199,12 +199,13 @@ def compare(
     numbers = _differences(found, seed) if found else dict.fromkeys(_PAIRED, UNDEFINED)
     numbers["variance_ratio"] = unless_few(variance_ratio(*finals), *runs)
     for name, statistic in (
-        ("variance_ratio_bootstrap", _ratio_of_variances),
+        ("variance_ratio_bootstrap", lambda x, y: x.var(axis=-1, ddof=1) / y.var(axis=-1, ddof=1)),
         ("probability_of_improvement", probability_of_improvement),
     ):
         numbers[name] = percentile(statistic, *finals, seed=seed)
     for name in STEPS_TO:
-        numbers[f"{name}_ratio"] = percentile(_ratio_of_medians, *pairs[name], seed=seed)
+        ratio = percentile(lambda x, y: median(x) / median(y), *pairs[name], seed=seed)
+        numbers[f"{name}_ratio"] = ratio
     return Comparison(
         representation=label.representation,
         numbers=numbers,
@@ -243,14 +244,6 @@ def probability_of_improvement(x: Array, y: Array) -> Array:
     n, m = x.shape[-1], y.shape[-1]
     ranks = rankdata(np.concatenate((x, y), axis=-1), axis=-1)[..., :n]
     return (ranks.sum(axis=-1) - n * (n + 1) / 2) / (n * m)
-
-
-def _ratio_of_variances(x: Array, y: Array) -> Array:
-    return x.var(axis=-1, ddof=1) / y.var(axis=-1, ddof=1)
-
-
-def _ratio_of_medians(x: Array, y: Array) -> Array:
-    return median(x) / median(y)
 
 
 def _brown_forsythe(x: Array, y: Array) -> float:
@@ -295,12 +288,8 @@ def _aggregate(
         iqm=interval(iqm),
         optimality_gap=interval(lambda each: (1 - np.minimum(each, 1)).mean(axis=-1)),
         scores=SCORES,
-        profile=interval(_shares_above),
+        profile=interval(lambda each: (each > SCORES.reshape(-1, *[1] * each.ndim)).mean(axis=-1)),
     )
-
-
-def _shares_above(scores: Array) -> Array:
-    return (scores > SCORES.reshape(-1, *[1] * scores.ndim)).mean(axis=-1)
 
 
 def to_plain(value: Any) -> Any:

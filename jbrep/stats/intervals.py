@@ -12,7 +12,7 @@ they have one (the delta method). Differences are taken within units (`jbrep.sta
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ LEVEL = 0.95
 RESAMPLES = 2000
 UNDEFINED = Interval(np.nan, np.nan, np.nan)
 _FEWEST_FOR_RATIOS = 3  # with two runs Bonett's interval of a ratio covers 86 %
+_FEWEST_PAIRS = 5  # or families for an interval: with fewer, ranks agree by chance too often
 FEWEST_RUNS = 4  # for an interval: three or fewer are better shown as points
 
 
@@ -178,3 +179,53 @@ def share_of_gain(x: Array, y: Array, reference: float, level: float) -> Interva
         return Interval(value, -np.inf, np.inf)
     half = math.sqrt(max(b * b - a * c, 0.0))
     return Interval(value, float(b - half) / a, float(b + half) / a)
+
+
+def rank_correlation(x: Array, y: Array, families: Sequence[str], seed: int = 0) -> Interval:
+    """Spearman's rank correlation of finite x and y, (n,), with its percentile bootstrap interval.
+
+    Spearman 1904, "The proof and measurement of association between two things": Pearson's
+    correlation of ranks, equal values sharing their mean rank. All is NaN for fewer than five
+    pairs, and where x or y doesn't vary.
+
+    Codes of one family, such as the autoencoders of several sizes, are much alike, so whole
+    families are resampled; of fewer than five there is no interval.
+
+    In 300 samples each of normal pairs with correlations of 0, 0.6 and 0.9, the intervals covered
+    88, 94 and 74 % for 5 codes, each a family, 97 % for 8, and 93, 97 and 98 % for 12: of five
+    pairs in the same order the interval has no width, which says little. Of 8 families of two
+    codes, which share .8 of the variance, they covered 95, 96 and 97 %.
+    """
+    if len(x) < _FEWEST_PAIRS or np.ptp(x) == 0 or np.ptp(y) == 0:
+        return UNDEFINED
+    found = over_families(lambda times: correlation_of_ranks(x, y, times), families, seed)
+    return found if len({*families}) >= _FEWEST_PAIRS else UNDEFINED._replace(value=found.value)
+
+
+def over_families(
+    statistic: Callable[[Array], Array], families: Sequence[str], seed: int = 0
+) -> Interval:
+    """A statistic of codes that each come so many times, (..., n), resampled by families."""
+    names, family = np.unique(families, return_inverse=True)
+    numbers = np.arange(len(names), dtype=np.float64)
+
+    def of_drawn(drawn: Array) -> Array:
+        times = (drawn[..., None] == numbers).sum(axis=-2)
+        return statistic(times[..., family])
+
+    return percentile(of_drawn, numbers, seed=seed)
+
+
+def correlation_of_ranks(x: Array, y: Array, times: Array) -> Array:
+    """Correlation of the ranks of x and y, (n,), each pair so many times, (..., n); (...)."""
+    x, y = _ranks(x, times), _ranks(y, times)
+    correlation: Array = (times * x * y).sum(-1) / np.sqrt(
+        (times * x * x).sum(-1) * (times * y * y).sum(-1)
+    )
+    return correlation
+
+
+def _ranks(values: Array, times: Array) -> Array:
+    """The mean rank of each value, (n,), that comes so many times, (..., n), about the middle."""
+    above = np.sign(values[:, None] - values)  # of a value over each other one
+    return times @ above.T / 2

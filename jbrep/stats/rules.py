@@ -280,7 +280,7 @@ def _tested(estimated: Verdict, claim: Claim, chain: _Chain, seed: int) -> Verdi
         verdict={1: SUPPORTED, -1: CONTRADICTED, 0: UNDECIDED}[0 if reason else direction],
         p=p,
         level=level,
-        interval=claim.tested(pair, 1 - level, seed),
+        interval=(claim.tested or claim.estimate)(pair, 1 - level, seed),
         reason=reason,
     )
 

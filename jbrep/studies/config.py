@@ -111,15 +111,13 @@ class Described(Record, frozen=True, kw_only=True):
     env: Mapping[str, Any] = {}
     episode_steps: EpisodeSteps | None = None
     action_bounds: str | None = None
-    features: str | Mapping[str, Any] | None = None
+    features: Mapping[str, Any] | None = None
     missing: Missing | None = None
     hide: tuple[str, ...] = ()
     history: Annotated[int, Meta(ge=1, le=1000)] | None = None
     domain: Mapping[str, Any] = {}
 
     def check(self) -> None:
-        if isinstance(self.features, str):
-            force_setattr(self, "features", read_toml(Path(self.features)))
         read_bounds(self.action_bounds)
         check_ranges(self.domain)
 
@@ -220,6 +218,8 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     def learner(self, name: str) -> Learner:
         """The learner of that name: a preset, or one with settings of its own."""
         own = self.learners.get(name)
+        if isinstance(own, dict) and "preset" in own:  # which could be any file
+            raise InputError(f"learners.{name} has a preset: it must hold what that says")
         return _learner(name, own) if own else Learner.of(name)
 
     def task(self, name: str) -> Task:
@@ -467,7 +467,10 @@ def as_study(given: Mapping[str, Any]) -> Study:
 def _task(number: int, of_all: Mapping[str, Any], given: Any) -> Described:
     """What is said of a task by its table, or by its name alone, and of all."""
     own = given if isinstance(given, Mapping) else {"task": taken_for(given)[0]}
-    return from_plain({**of_all, **own}, Described, f"tasks[{number}]")
+    said = {**of_all, **own}
+    if isinstance(path := said.get("features"), str):
+        said["features"] = read_toml(Path(path))
+    return from_plain(said, Described, f"tasks[{number}]")
 
 
 def _read_data(given: Mapping[str, Any] | None) -> Mapping[str, Data] | None:

@@ -281,15 +281,12 @@ def _curve(tables: Tables, run: RunFacts, by_step: Mapping[int, list[float]]) ->
         top=_mean(able[: shared.final_episodes]),
         top_in_training=_mean(able[:episodes]),
         solved=task.solved_return,
-        environment=_environment(task),
+        environment=", ".join(
+            [task.id, *task.given_arguments, counted(task.max_episode_steps, "step")]
+        ),
         final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
         encoder_seed=run.encoder_seed,
     )
-
-
-def _environment(task: Task) -> str:
-    """What decides which returns there can be, as text for a message."""
-    return ", ".join([task.id, *task.given_arguments, counted(task.max_episode_steps, "step")])
 
 
 def _mean(returns: Sequence[float]) -> float | None:

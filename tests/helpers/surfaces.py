@@ -227,7 +227,7 @@ def _report(study: Path):
     def read(folder):
         files(folder)
         tables = read_tables(folder / "alone")
-        return tables.returns, tables.references, tables.record.text()
+        return tables.raw.returns, tables.raw.references, tables.raw.record.text()
 
     return Surface(act, result, files, read, prepare)
 

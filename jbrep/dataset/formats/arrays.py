@@ -37,7 +37,7 @@ def frame_of_arrays(name: str, arrays: Mapping[str, Array], **more: Any) -> Fram
             unusable[column] = f"of type {each.dtype}, no plain numbers"
         elif is_image(each):
             unusable[column] = "images, or more numbers than features can be"
-        elif len(each) != rows or not math.prod(each.shape[1:]):
+        elif not each.ndim or len(each) != rows or not math.prod(each.shape[1:]):
             unusable[column] = f"of shape {each.shape}: there must be numbers in {rows:,} rows"
         else:
             columns[column] = column_of(each)
@@ -62,11 +62,15 @@ def frame_of_steps(
     """
     own = own_names(name, arrays)
     check_names(name, own, arrays)
+    for what, column in own.items():
+        array_of(name, what, arrays[column])
     known = {what: array_of(name, what, values) for what, values in once.items()}
     check_lengths(name, known, "episodes")
     if "seed" in known and known["seed"].dtype.kind not in "iu":
         raise InputError(f"{name} has seeds of type {known['seed'].dtype}: they must be whole")
     observation, final = own["observation"], known.pop("final_observation", None)
+    if final is not None and final.dtype.kind not in "fiub":
+        raise InputError(f"{name} has final observations of type {final.dtype}: no plain numbers")
     row = arrays[observation].shape[1:]
     if not (about.names or about.features):
         numbers = (Feature(name=f"obs_{i}", group="obs") for i in range(math.prod(row)))

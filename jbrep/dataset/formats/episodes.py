@@ -147,6 +147,9 @@ def episode_of(where: str, rows: Rows, once: Mapping[str, Any]) -> Incoming | No
         _check_following(where, after[:-1].astype(np.float32), observation[1:].astype(np.float32))
     final = once.get("final_observation", following)
     ended = {name: rows[name][-1] for name in ENDS if name in rows} | {**once}
+    for name in ENDS:
+        if (ends := ended.get(name, False)) not in (0, 1):
+            raise InputError(f"{where} has {ends} for {name}: it must be 0 or 1")
     seed, steps = int(once.get("seed", UNKNOWN_SEED)), len(observation) - (final is None)
     if not UNKNOWN_SEED <= seed < 1 << 63:
         raise InputError(f"{where} has the seed {seed}: it must be from 0 to 2**63 - 1, or -1")

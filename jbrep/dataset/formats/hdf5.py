@@ -99,17 +99,18 @@ def _frame_of_demos(name: str, demos: dict[str, dict[str, Array]], told: Any) ->
         columns["terminated"] = ends & (np.arange(steps) == steps - 1)
         episodes[where] = columns
     note = f"{counted(early, 'step')} done before the end of a demo: the episode goes on there"
-    environment, rate = "", None
+    environment, rate = "", 0.0
     with suppress(ValueError, TypeError, KeyError, AttributeError):
         known = json.loads(told)
-        environment, rate = str(known["env_name"]), known.get("env_kwargs", {}).get("control_freq")
+        environment = str(known["env_name"])
+        rate = float(known["env_kwargs"]["control_freq"])
     columns, place = joined(name, episodes)
     return frame_of_arrays(
         name,
         columns,
         label=label_of(environment or Path(name).stem),
         place=place,
-        timestep=1 / rate if rate else None,
+        timestep=1 / rate if 0 < rate < math.inf else None,
         layout=Layout(observations=tuple(after) or (_NOW,), actions=("actions",)),
         after=after,
         about=_about(columns),

@@ -72,10 +72,11 @@ def read(given: str) -> Frame:
             arrays["action"] = _flat(actions, episode["actions"])
             episodes[f"episode {number}"] = arrays
         seeds = [each.get("seed") for each in stored.get_episode_metadata(numbers)]
+        own = told.get(_OWN, {})
+        offsets, own_rewards = (*map(float, own.get("offsets", ())),), own.get("own_rewards")
     task, why_not, label, limit = _task(told, label_of(name), (len(features), flatdim(actions)))
-    own = told.get(_OWN, {})
     columns, place = joined(name, episodes)
-    about = About(features=task.features if task else features, offsets=(*own.get("offsets", ()),))
+    about = About(features=task.features if task else features, offsets=offsets)
     return frame_of_steps(
         name,
         columns,
@@ -83,7 +84,7 @@ def read(given: str) -> Frame:
         about,
         label=label,
         place=place,
-        task=without_range(task) if task and own.get("own_rewards") else task,
+        task=without_range(task) if task and own_rewards else task,
         why_no_task=why_not,
         action_bounds=(actions.low.ravel(), actions.high.ravel()),
         max_episode_steps=limit,
@@ -166,6 +167,7 @@ def write(dataset: Dataset, out: Path) -> str:
     }
     bounds = np.array((task.action_low, task.action_high), np.float32)
     seen = spaces.Box(-np.inf, np.inf, (task.size,), np.float32)
+    out = out.absolute()  # Minari joins a relative path to itself
     path, actions, spec = out / name, spaces.Box(*bounds, dtype=np.float32), _env_spec(settings)
     make_folder(path.parent)
     episodes = len(dataset.episodes["length"]) * _EPISODE_BYTES

@@ -27,6 +27,7 @@ from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line, refusing
 from jbrep.progress import Progress
+from jbrep.records.document import parse_json
 from jbrep.records.record import from_plain
 from jbrep.records.storage import exists, publish, unfinished
 
@@ -69,7 +70,7 @@ def batches_of(paths: list[Path], columns: list[str]) -> Iterator[pa.RecordBatch
 
 def _exported(path: Path, schema: pa.Schema, settings: bytes) -> dict[str, Any]:
     """What a frame has besides, of a table that jbrep exported."""
-    task = from_plain(json.loads(settings)["environment"], Task)
+    task = from_plain(parse_json(settings, path, "table of jbrep's")["environment"], Task)
     if not {*task.feature_names} <= {*schema.names}:
         return {}
     beside = _beside(path)
