@@ -1,4 +1,4 @@
-"""What a controller needs of the state: a good policy's action and value, and what a code loses."""
+"""What a controller needs of the state: a good policy's action and value, and what a latent loses."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -259,7 +259,7 @@ def _shares(
 
 
 def lost(needed: Mapping[str, float], probes: Scores) -> tuple[Lost, ...]:
-    """The needed features that nonlinear probes can't read from a code, the most needed first."""
+    """The needed features that nonlinear probes can't read from a latent, the most needed first."""
     return tuple(
         Lost(name=name, kept=kept, need=need)
         for name, need in sorted(needed.items(), key=lambda item: -item[1])

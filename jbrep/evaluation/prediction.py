@@ -1,4 +1,4 @@
-"""Controlled forward prediction: what a code and the next actions say of what comes next."""
+"""Controlled forward prediction: what a latent and the next actions say of what comes next."""
 
 from collections.abc import Mapping
 from itertools import pairwise

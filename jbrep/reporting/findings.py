@@ -136,7 +136,7 @@ class Aggregate(Record, frozen=True, kw_only=True):
 
 
 class Diagnosed(Record, frozen=True, kw_only=True):
-    """A diagnostic of the codes of a task, beside what one algorithm learned from them."""
+    """A diagnostic of the representations of a task, beside what one algorithm learned from them."""
 
     task: str
     algorithm: str
@@ -342,7 +342,7 @@ def _in_training(tables: Tables) -> dict[str, dict[str, float]]:
 
 
 def _diagnosed(tables: Tables, analysis: Analysis) -> Iterator[Diagnosed]:
-    """Each registered diagnostic that is known of some code, with final returns."""
+    """Each registered diagnostic that is known of some representation, with final returns."""
     families = {}
     for label in tables.raw.record.labels.values():
         name, kind = label.settings.representation, label.encoder.kind

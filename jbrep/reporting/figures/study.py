@@ -289,8 +289,8 @@ _PLOTS = (
     _Spec(
         "diagnostics",
         "Final return against diagnostics",
-        "Each code by each diagnostic, better ones to the right, with its mean final return. In "
-        "brackets, where there are five codes or more: the rank correlation, 1 if the better value "
+        "Each representation by each diagnostic, better ones to the right, with its mean final return. In "
+        "brackets, where there are five or more: the rank correlation, 1 if the better value "
         "always goes with the higher return.",
         _diagnosed,
         line("value", "final_return", linestyle="none", ms=4, markevery=1),
