@@ -1,4 +1,4 @@
-"""What a controller needs of the state: a good policy's action and value, and what a latent loses."""
+"""What a controller needs of the state: a good policy's action and value; what latents lose."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress

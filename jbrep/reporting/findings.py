@@ -136,7 +136,7 @@ class Aggregate(Record, frozen=True, kw_only=True):
 
 
 class Diagnosed(Record, frozen=True, kw_only=True):
-    """A diagnostic of the representations of a task, beside what one algorithm learned from them."""
+    """A diagnostic of a task's representations, beside what one algorithm learned from them."""
 
     task: str
     algorithm: str

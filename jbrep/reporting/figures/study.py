@@ -289,9 +289,9 @@ _PLOTS = (
     _Spec(
         "diagnostics",
         "Final return against diagnostics",
-        "Each representation by each diagnostic, better ones to the right, with its mean final return. In "
-        "brackets, where there are five or more: the rank correlation, 1 if the better value "
-        "always goes with the higher return.",
+        "Each representation by each diagnostic, better ones to the right, with its mean final "
+        "return. In brackets, where there are five or more: the rank correlation, 1 if the better "
+        "value always goes with the higher return.",
         _diagnosed,
         line("value", "final_return", linestyle="none", ms=4, markevery=1),
         ("words", "final return"),
