@@ -156,7 +156,7 @@ def test_a_study_and_its_report(folder):
     assert all(run["label"] in page for run in found["runs"])
     assert (len(found["runs"]), found["missing"], found["verdicts"]) == (4, {}, [])
     assert (
-        "| agents on | runs | final return | above baselines |"
+        "| agents on | final return | above baselines |"
         in (study / "summary.md").read_text()
     )
     assert {path.suffix for path in (study / "figures").iterdir()} == {".csv", ".pdf", ".png"}

@@ -364,6 +364,12 @@ def test_damaged_tables_are_refused(name, change, message, whole, tmp_path):
     assert sorted(tmp_path.iterdir()) == before
 
 
+def test_committed_results_have_their_tables():
+    for path in Path("results").glob("*/runs.json"):
+        there = {each.name for each in path.parent.iterdir()}
+        assert json.loads(path.read_text())["tables"].keys() <= there, path
+
+
 @pytest.mark.parametrize("study", ["ablation-speed", "breadth", "cheetah", "confirm", "longer"])
 def test_committed_results_are_those_of_their_tables(study):
     """Findings and summaries come from the tables anew, the same to the byte but for rounding."""
@@ -396,8 +402,8 @@ def test_references_of_an_environment_that_is_not_here_stay(tmp_path, monkeypatc
     plan = make_study(tmp_path / "it")
     write_tables(plan.folder)
     write_policies(plan.folder, STUDY.replace(evaluation_episodes=1, final_episodes=1))
-    before = read_tables(plan.folder).references
+    before = read_tables(plan.folder).raw.references
     monkeypatch.setattr("jbrep.studies.tables.play", away)
     with pytest.warns(Notice, match="couldn't be played on face_direction: it isn't here"):
         play_references(plan.folder)
-    assert read_tables(plan.folder).references == before
+    assert read_tables(plan.folder).raw.references == before

@@ -118,9 +118,8 @@ def _returns_table(name: str, groups: Sequence[Group], found: Findings, brief: b
     columns: Cells = {
         "failed": lambda each: str(len(each.failed) or "-"),
         "final return": _number("final_return_mean", form),
-        "above baselines": lambda each: each.learnt,
+        "above baselines": lambda each: f"{each.learnt}{', rising' if each.rises else ''}",
         "score": _number("score", ".2f"),
-        "rising": lambda each: "yes" if each.rises else "-",
         **(
             {f"predicted ({_ADVICE})": lambda each: r2_text(advised.get(each.representation))}
             if advised

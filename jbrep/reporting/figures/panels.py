@@ -69,6 +69,7 @@ _BEYOND = 0.25  # of their range, for the ends of intervals on either side
 _NAMES_APART = 0.06  # of an axis, between names of lines
 _JITTER = 0.16  # between the outermost runs and the middle of their column
 _CHARACTER, _HANDLE, _LINE = 0.05, 0.5, 0.14  # of a legend: widths, height of a line [inches]
+_MOST_ACROSS = 55  # characters of the names of columns
 _USUAL_LINES = 3  # of a legend, that figures have room for
 
 
@@ -334,9 +335,10 @@ def fitting(
 
 
 def tilt(axes: Axes, _: object = None) -> None:
-    """Turn the names of columns, if they are many."""
-    if len(axes.get_xticks()) > 3:
-        for name in axes.get_xticklabels():
+    """Turn the names of columns, if they are too long to stand side by side."""
+    names = axes.get_xticklabels()
+    if len(names) * max(len(name.get_text()) for name in names) > _MOST_ACROSS:
+        for name in names:
             name.set(rotation=30, ha="right", rotation_mode="anchor")
 
 
