@@ -71,8 +71,8 @@ pictures: $(READY) ## the pictures in docs/, drawn anew
 	rm -f docs/jitterbug.gif
 	$(BIN)/jbrep render uniform trained --task move_to_pose --episode 18 --seconds 4 --speed 0.7 --fps 10 --size 240x180 --out docs/jitterbug.gif
 	$(BIN)/jbrep inspect data/sample/face_direction --episode 1 --encoder dae-8 --out inspect/shown.rrd
-	$(BIN)/jbrep report results/answer-move-to-position
-	MUJOCO_GL=egl $(BIN)/python tools/pictures.py results/answer-move-to-position/report.html inspect/shown.rrd docs
+	$(BIN)/jbrep report results/arm
+	MUJOCO_GL=egl $(BIN)/python tools/pictures.py results/arm/report.html inspect/shown.rrd docs
 
 docs: $(READY) ## the documentation as a site, in site/
 	$(BIN)/python tools/site.py site
