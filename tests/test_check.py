@@ -13,6 +13,7 @@ from jbrep.checking.features import turn_of
 from jbrep.cli import main
 from jbrep.coordinates import make_coordinates
 from jbrep.errors import InputError
+from jbrep.methods.registry import METHODS
 
 SAW = np.cumsum(np.full(300, 0.0537)) % 1
 STEPS = 2200  # 200 by each policy
@@ -120,7 +121,10 @@ def test_data_are_read_in_place_of_play(tmp_path):
     assert check.played is None
     (note,) = check.notes
     assert "reproducible" in note
-    assert "train-encoder" in check.advice.command
+    plain = jbrep.check(data=jbrep.collect("Pendulum-v1", tmp_path / "plain", STEPS))
+    for each, kind in ((check, "coordinates"), (plain, "full")):
+        assert f"train-encoder --kind {kind} " in each.advice.command
+        assert kind in METHODS
     with pytest.raises(InputError, match="give a task, or else data"):
         jbrep.check("Faulty/Wrapped-v0", data=data)
 

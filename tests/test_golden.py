@@ -155,10 +155,7 @@ def test_a_study_and_its_report(folder):
     page = (study / "report.html").read_text()
     assert all(run["label"] in page for run in found["runs"])
     assert (len(found["runs"]), found["missing"], found["verdicts"]) == (4, {}, [])
-    assert (
-        "| agents on | final return | above baselines |"
-        in (study / "summary.md").read_text()
-    )
+    assert "| agents on | final return | above baselines |" in (study / "summary.md").read_text()
     assert {path.suffix for path in (study / "figures").iterdir()} == {".csv", ".pdf", ".png"}
 
 

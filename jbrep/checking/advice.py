@@ -74,10 +74,9 @@ def advise(
         if use_file and not where:
             lines.insert(0, ["check", *_given(task, own)[1:], "--write", "features.toml"])
     else:
-        kind = "identity" if system == "full" else system
         again = f"{data}-seen" if view else str(data)
         lines = [["data", "derive", str(data), *view, "--out", again]] if view else []
-        lines += [["train-encoder", "--kind", kind, "--data", again, "--out", "encoders"]]
+        lines += [["train-encoder", "--kind", system, "--data", again, "--out", "encoders"]]
     command = "\n".join(shlex.join(["jbrep", *each]) for each in lines)
     return Advice(system, why, command, features)
 

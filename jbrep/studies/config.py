@@ -55,7 +55,7 @@ class Data(Record, frozen=True, kw_only=True):
     """Data that encoders are made from: collected for the study, or an existing data set."""
 
     steps: Annotated[
-        int, Meta(ge=0, le=MAX_STEPS, description="Of states to collect for the encoders.")
+        int, Meta(ge=0, le=MAX_STEPS, description="States to collect for the encoders.")
     ] = 0
     policy: Annotated[
         str,
