@@ -299,7 +299,8 @@ def _may_fail(pair: Pair, excess: float, level: float) -> str | None:
     if abs(excess) > lost:
         return None
     which = "it" if excess > 0 else "the other"
-    return f"up to {100 * (more + failing / units):.0f} % of runs on {which} may fail, unseen"
+    share = 100 * (more + failing / units)
+    return f"so few runs can't rule out that up to {share:.0f} % on {which} fail"
 
 
 def most_failing(failing: int, units: int, level: float) -> float:
