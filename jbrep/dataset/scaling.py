@@ -165,7 +165,7 @@ def _robust(features: Features, parts: Parts, rows: Rows) -> Range:
 
 
 SCALINGS: dict[str, Callable[[Features, Parts, Rows], Range]] = {
-    EXTREMA: lambda features, parts, rows: extrema(parts(rows)),
+    EXTREMA: lambda features, parts, rows: extrema(parts(rows)),  # minimum and maximum
     NOMINAL: _nominal,  # the task's usual ranges
     "standard": _standard,  # the mean, and three standard deviations to either side
     "robust": _robust,  # the median, and half the distance from the 1 % to the 99 % quantile
