@@ -150,7 +150,7 @@ data/unseen: $(READY)
 PROGRAMME := $(shell sed -n 's/^\(\(answer\|identify\|size\|body\)-[a-z0-9-]*\) *;.*/\1/p' studies/judged.txt)
 answer: $(READY) ## all its tasks side by side, and sizes, from the tables: results/answer.png, small.png
 	$(BIN)/python tools/answer.py results/answer.png $(sort $(wildcard results/answer-*))
-	$(BIN)/python tools/small.py results/small.png $(sort $(wildcard results/size-*))
+	$(BIN)/python tools/small.py results/small.png $(sort $(wildcard results/size-* results/small-*))
 programme: $(PROGRAMME) ## all studies of the answer, one after another: a night; goes on where it was stopped
 programme-time: $(READY) ## how long that takes here, without what has ended
 	for study in $(PROGRAMME); do $(BIN)/jbrep study studies/$$study.toml --dry-run --out runs/$$study || exit; done
