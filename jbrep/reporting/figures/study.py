@@ -33,8 +33,8 @@ from jbrep.stats.runs import in_order
 _GROUP = ("task", "algorithm")
 _SPREAD = "SD over runs"
 _ENDS = ("value", "low", "high")
-_DASHED = " Dashed: policies that don't learn"
-_DOTTED = "; dotted: the return that counts as solved"
+_DASHED = " Dashed: policies that don't learn."
+_DOTTED = " Dotted: the return that counts as solved."
 
 
 class _Spec(NamedTuple):
@@ -93,9 +93,9 @@ def _plot(
     if (several := len(found.algorithms)) > 1 and spec.facet == _GROUP:
         how |= {"across": min(several, 6), "title": ",\n".join}
     draw = partial(draw, lines=lines, limits=limits, **{**how, **spec.more})
-    caption = spec.caption
-    if drawn := {name for each in lines.values() for name in each}:
-        caption += f"{_DASHED}{_DOTTED if 'solved' in drawn else ''}."
+    drawn = {name for each in lines.values() for name in each}
+    dashed, dotted = drawn - {"solved"} and _DASHED, drawn & {"solved"} and _DOTTED
+    caption = f"{spec.caption}{dashed or ''}{dotted or ''}"
     return Plot(spec.name, spec.title, caption, rows, draw)
 
 
