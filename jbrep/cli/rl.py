@@ -19,7 +19,6 @@ def _rl(task: DrawnTask, out: Path, **options: Annotated[Any, api.train]) -> boo
         from jbrep.encoders.shipped import source_of
         from jbrep.envs.infos import shares_text
         from jbrep.envs.make import is_one_robot
-        from jbrep.play.references import beside, mean_text
         from jbrep.rl.files import EVALUATIONS, RUN, last_infos, read_evaluations, read_infos
 
         with _told_when_stopped(received, f"; {RESUMES}" if task.reproducible else ""):
@@ -33,6 +32,8 @@ def _rl(task: DrawnTask, out: Path, **options: Annotated[Any, api.train]) -> boo
     if told := shares_text(last_infos(read_infos(out), read_evaluations(out))):
         tell(told)
     with stoppable("the run itself is finished"):
+        from jbrep.play.references import beside, mean_text  # which import scipy.stats
+
         alone = is_one_robot(task, options.get("threads"))
         compared = None if alone else beside(task, returns)
         tell(f"{shown} {compared or mean_text(task, returns)}")
