@@ -70,7 +70,7 @@ def batches_of(paths: list[Path], columns: list[str]) -> Iterator[pa.RecordBatch
 
 def _exported(path: Path, schema: pa.Schema, settings: bytes) -> dict[str, Any]:
     """What a frame has besides, of a table that jbrep exported."""
-    task = from_plain(parse_json(settings, path, "table of jbrep's")["environment"], Task)
+    task = from_plain(parse_json(settings, path, "jbrep")["environment"], Task)
     if not {*task.feature_names} <= {*schema.names}:
         return {}
     beside = _beside(path)
