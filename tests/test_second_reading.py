@@ -1,6 +1,7 @@
 """What a second reader of the code broke: each is a line, or works."""
 
 import json
+import sys
 import time
 
 import gymnasium
@@ -72,7 +73,7 @@ def test_what_was_refused_before_its_first_shard_can_be_corrected(tmp_path, monk
     policy.write_text("def act(observation):\n    return 'up'\n")
     assert mistake(*collect)
     policy.write_text("def act(observation):\n    return [0.0]\n")
-    monkeypatch.delitem(__import__("sys").modules, "correctable")
+    monkeypatch.delitem(sys.modules, "correctable")
     assert jbrep(*collect).exit_code == 0
     assert len(Dataset("data")) == 20
 
@@ -83,11 +84,14 @@ def changed(name, value):
 
 def test_ranges_and_lengths_are_verified(brief, tmp_path):
     write_again(brief, tmp_path / "far", changed("action", 5))
-    assert all("action 0 ranges from 5 to 5" in line for line in find_problems(tmp_path / "far"))
+    problems = [*find_problems(tmp_path / "far")]
+    assert len(problems) == 5
+    assert all("action 0 ranges from 5 to 5" in line for line in problems)
     manifest = write_again(brief, tmp_path / "odd")
     entry = manifest.shards[0]
-    for offsets in ({}, dict.fromkeys(entry.offsets, 10**9)):
-        odd = manifest.replace(shards=(entry.replace(offsets=offsets), *manifest.shards[1:]))
+    far = dict.fromkeys(entry.offsets, 10**9)
+    for change in ({"offsets": {}}, {"offsets": far}, {"rows": entry.rows - 1}):
+        odd = manifest.replace(shards=(entry.replace(**change), *manifest.shards[1:]))
         with pytest.raises(DamageError, match="shard-00000"):
             open_shard(tmp_path / "odd", odd, 0)
     for policy in ({}, {"kind": "trained"}, {"kind": "mixture", "parts": [1]}):

@@ -148,7 +148,7 @@ def info(encoder: _Which, /, *, task: OptionalTask = None, as_json: AsJson = Fal
 
     shown, source = find_alone(encoder, task), source_of(encoder, task)
     if as_json:
-        return say_json(described(shown, source))
+        return say_json(_described(shown, source))
     return say(card(shown, source, terminal_width()))
 
 
@@ -201,7 +201,7 @@ def import_model(
     say(card(made, str(out), terminal_width()))
 
 
-def described(encoder: "BaseEncoder", source: str) -> dict[str, Any]:
+def _described(encoder: "BaseEncoder", source: str) -> dict[str, Any]:
     """An encoder's card as plain JSON, with its source, as `source_of` says it."""
     from jbrep.encoders import Encoder
 
@@ -235,7 +235,7 @@ def described(encoder: "BaseEncoder", source: str) -> dict[str, Any]:
 
 def card(encoder: "BaseEncoder", source: str, width: int) -> str:
     """The same in lines; of a file, also the range of each feature, scaled to [-1, 1]."""
-    told = described(encoder, source)
+    told = _described(encoder, source)
     features = told.pop("features", ())
     for part in ("encoder", "decoder"):
         if part in told:

@@ -74,7 +74,6 @@ _REFUSED = {  # arguments that are jbrep's own, with the reason
         ("use_sde", "sde_sample_freq", "use_sde_at_warmup"), "a checkpoint has no noise on features"
     ),
 }
-_QUANTILES = 25  # of each of TQC's critics, by default
 _NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "net_arch"}
 
 
@@ -227,12 +226,12 @@ def _check_together(algorithm: str, chosen: Hyperparameters) -> None:
             "gradient_steps is 0, with which nothing is learned: it must be above, or -1 for as "
             "many as there were steps"
         )
-    dropped, of = given("top_quantiles_to_drop_per_net"), chosen.policy_kwargs.get("n_quantiles")
-    if dropped is not None and dropped >= (of or _QUANTILES):
-        raise InputError(
-            f"top_quantiles_to_drop_per_net is {dropped}: of {of or _QUANTILES} quantiles one must "
-            "be left"
-        )
+    if (dropped := given("top_quantiles_to_drop_per_net")) is not None:
+        usual = parameters_of(algorithm)[1]["n_quantiles"].default
+        if dropped >= (of := chosen.policy_kwargs.get("n_quantiles", usual)):
+            raise InputError(
+                f"top_quantiles_to_drop_per_net is {dropped}: of {of} quantiles one must be left"
+            )
 
 
 def _build(algorithm: str, chosen: Hyperparameters) -> None:

@@ -48,10 +48,7 @@ def common_grid(group: Group) -> tuple[Array, str | None]:
     runs = list(chain.from_iterable(group.values()))
     whole = [run for run in runs if run.failed_at is None]
     start = max(_first(run) for run in runs)
-    ends = (
-        int(run.steps[-1]) if run.failed_at is None else run.total_steps for run in whole or runs
-    )
-    end = min(ends)
+    end = min(_last(run) for run in whole or runs)
     if start >= end:
         raise InputError(
             f"{runs[0].task}/{runs[0].algorithm}: the evaluations of one run end at step {end}, "
@@ -66,6 +63,10 @@ def _first(run: RunCurve) -> int:
     """The first step of its curve: 0 if it failed before it was evaluated."""
     steps, _ = run.curve()
     return 0 if steps[0] == run.failed_at else int(steps[0])
+
+
+def _last(run: RunCurve) -> int:
+    return run.total_steps if run.failed_at is not None else int(run.steps[-1])
 
 
 def _cut(runs: list[RunCurve], end: int) -> str | None:

@@ -188,13 +188,13 @@ def rank_correlation(x: Array, y: Array, families: Sequence[str], seed: int = 0)
     correlation of ranks, equal values sharing their mean rank. All is NaN for fewer than five
     pairs, and where x or y doesn't vary.
 
-    Codes of one family, such as the autoencoders of several sizes, are much alike, so whole
+    Encoders of one family, such as the autoencoders of several sizes, are much alike, so whole
     families are resampled; of fewer than five there is no interval.
 
     In 300 samples each of normal pairs with correlations of 0, 0.6 and 0.9, the intervals covered
-    88, 94 and 74 % for 5 codes, each a family, 97 % for 8, and 93, 97 and 98 % for 12: of five
+    88, 94 and 74 % for 5 encoders, each a family, 97 % for 8, and 93, 97 and 98 % for 12: of five
     pairs in the same order the interval has no width, which says little. Of 8 families of two
-    codes, which share .8 of the variance, they covered 95, 96 and 97 %.
+    encoders, which share .8 of the variance, they covered 95, 96 and 97 %.
     """
     if len(x) < _FEWEST_PAIRS or np.ptp(x) == 0 or np.ptp(y) == 0:
         return UNDEFINED
@@ -205,7 +205,7 @@ def rank_correlation(x: Array, y: Array, families: Sequence[str], seed: int = 0)
 def over_families(
     statistic: Callable[[Array], Array], families: Sequence[str], seed: int = 0
 ) -> Interval:
-    """A statistic of codes that each come so many times, (..., n), resampled by families."""
+    """A statistic of encoders that each come so many times, (..., n), resampled by families."""
     names, family = np.unique(families, return_inverse=True)
     numbers = np.arange(len(names), dtype=np.float64)
 

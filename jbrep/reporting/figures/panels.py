@@ -243,13 +243,12 @@ def line(
 
 def _name_at_end(axes: Axes, value: float, name: str, colour: str) -> None:
     """Write the name of a line beside its end; names keep the order of the ends, and apart."""
+    at, where = (1.03, value), axes.get_yaxis_transform()
     look: Any = {"size": 6, "va": "center", "color": colour, "clip_on": False}
-    transform = axes.get_yaxis_transform()
-    text = axes.text(1.03, value, name.partition(" (n")[0], transform=transform, **look)
-    text.set_gid(repr(value))
-    names = sorted(axes.texts, key=lambda each: float(each.get_gid() or 0))
+    axes.annotate(name.partition(" (n")[0], at, at, xycoords=where, textcoords=where, **look)
+    names: list[Any] = sorted(axes.texts, key=lambda each: each.xy[1])  # annotations alone
     gaps = _NAMES_APART * np.diff(axes.get_ylim()) * np.arange(len(names))
-    ends = np.array([float(each.get_gid() or 0) for each in names])
+    ends = np.array([each.xy[1] for each in names])
     for each, place in zip(names, isotonic_regression(ends - gaps).x + gaps, strict=True):
         each.set_y(place)
 

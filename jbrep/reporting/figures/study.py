@@ -94,8 +94,7 @@ def _plot(
         how |= {"across": min(several, 6), "title": ",\n".join}
     draw = partial(draw, lines=lines, limits=limits, **{**how, **spec.more})
     drawn = {name for each in lines.values() for name in each}
-    dashed, dotted = drawn - {"solved"} and _DASHED, drawn & {"solved"} and _DOTTED
-    caption = f"{spec.caption}{dashed or ''}{dotted or ''}"
+    caption = spec.caption + _DASHED * bool(drawn - {"solved"}) + _DOTTED * ("solved" in drawn)
     return Plot(spec.name, spec.title, caption, rows, draw)
 
 
