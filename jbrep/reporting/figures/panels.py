@@ -67,9 +67,7 @@ _ROOM = 0.04  # of an axis, at its ends, for whole markers
 _FILLED = 1 / 3  # of an axis, at least, by the values themselves
 _BEYOND = 0.25  # of their range, for the ends of intervals on either side
 _NAMES_APART = 0.06  # of an axis, between names of lines
-_JITTER = 0.16  # between the outermost runs and the middle of their column
 _CHARACTER, _HANDLE, _LINE = 0.05, 0.5, 0.14  # of a legend: widths, height of a line [inches]
-_MOST_ACROSS = 55  # characters of the names of columns
 _USUAL_LINES = 3  # of a legend, that figures have room for
 
 
@@ -141,10 +139,9 @@ def panels(
     title: Callable[[Key], str] = ", ".join,
     lines: Mapping[Key, Mapping[str, float]] = {},
     limits: Mapping[Key, Limits] = {},
-    limited: str = "y",
     across: int = 3,
     height: float = 2.0,
-    wide: bool = False,
+    row: float = 0.0,
     finish: Callable[[Axes, Sequence[Row]], object] = lambda axes, rows: None,
 ) -> Figure:
     """A panel for each facet of a table, in it a mark for each series.
@@ -159,31 +156,36 @@ def panels(
         colour: the column that decides looks, if not that of the series.
         names: what legends call the series.
         title: of a panel, from what its rows share.
-        lines: to compare with, by panel and name, on the axis that is limited.
+        lines: to compare with, by panel and name, on the axis of values.
         limits: of that axis, by panel.
-        limited: x or y.
         across: panels side by side, at most.
-        height: of a panel [inches].
-        wide: one panel is as wide as a page, not a column.
+        height: of a panel [inches], without its rows.
+        row: height of a row [inches]: each series is one, with its name, and values are on the x
+            axis, not on y.
         finish: what is done to a panel at last.
     """
     parts = by(rows, *facet)
     across = min(across, len(parts))
     down = -(-len(parts) // across)
-    figure = Figure(figsize=(PAGE if across > 1 or wide else COLUMN, 0.4 + height * down))
+    height += row * max(len(by(own, series)) for own in parts.values())
+    figure = Figure(figsize=(PAGE if across > 1 or row else COLUMN, 0.4 + height * down))
     grid = figure.subplots(down, across, squeeze=False).ravel()
     for axes in grid[len(parts) :]:
         axes.set_axis_off()
     for number, (axes, (key, own)) in enumerate(zip(grid, parts.items(), strict=False)):
         if key in limits:
-            axes.set(**{f"{limited}lim": limits[key]})
-        draw_line = axes.axhline if limited == "y" else axes.axvline
+            axes.set(**{"xlim" if row else "ylim": limits[key]})
+        draw_line = axes.axvline if row else axes.axhline
         for i, (name, value) in enumerate(lines.get(key, {}).items()):
             dotted = {"linestyle": ":"} if name == "solved" else {}
             draw_line(value, label=plain(name), **{**reference(i), **dotted})
-        for place, ((name,), of_series) in enumerate(by(own, series).items()):
-            look = looks[of_series[0][colour or series]]
-            mark(axes, of_series, look, plain(str(names.get(name, name))), place)
+        named = [plain(str(names.get(name, name))) for (name,) in by(own, series)]
+        for place, of_series in enumerate(by(own, series).values()):
+            mark(axes, of_series, looks[of_series[0][colour or series]], named[place], place)
+        if row:
+            axes.set_yticks(range(len(named)), named if number % across == 0 else [""] * len(named))
+            axes.set_ylim(len(named) - 0.4, -0.6)
+            axes.grid(visible=False, axis="y")
         axes.set_title(plain(title(key)), size=7.5 if across <= 3 else 6)
         x, y = axis_labels
         if x in own[0] or number + across >= len(parts):
@@ -253,41 +255,6 @@ def _name_at_end(axes: Axes, value: float, name: str, colour: str) -> None:
         each.set_y(place)
 
 
-def runs_and_mean(value: str, mean: str, low: str, high: str) -> Mark:
-    """A mark: a column with a point for each run, and their mean with its interval."""
-
-    def draw(axes: Axes, rows: Sequence[Row], look: Look, name: str, place: int) -> None:
-        points = column(rows, value)
-        apart = np.linspace(-_JITTER, _JITTER, len(points)) * (len(points) > 1)
-        axes.plot(place - 0.22 + apart, points, ".", color=look["color"], ms=4, alpha=0.6, mew=0)
-        ends = [column(rows[:1], each)[0] for each in (mean, low, high)]
-        draw_interval(axes, "y", place + 0.16, ends, look)
-        before = [text.get_text() for text in axes.get_xticklabels()] if place else []
-        axes.set_xticks(range(place + 1), [*before, name])
-        axes.set_xlim(-0.6, place + 0.6)
-        axes.grid(visible=False, axis="x")
-
-    return draw
-
-
-def draw_interval(
-    axes: Axes, along: str, at: float, ends: Sequence[float], look: Look, width: float = 1.4
-) -> None:
-    """A value, low and high, at a place on the other axis; triangles where it leaves the panel."""
-    edges = axes.get_ylim() if along == "y" else axes.get_xlim()
-
-    def draw(values: Sequence[float], **how: Any) -> None:
-        points = np.full(len(values), at), np.clip(values, *edges)
-        axes.plot(*(points if along == "y" else points[::-1]), color=look["color"], **how)
-
-    draw(ends[1:], lw=width)
-    draw(ends[:1], marker=look["marker"], ms=4)
-    is_cut = np.nanmin(ends) < edges[0], np.nanmax(ends) > edges[1]
-    for edge, marker, cut in zip(edges, "v^" if along == "y" else "<>", is_cut, strict=True):
-        if cut:
-            draw([edge], marker=marker, ms=3.5, mew=0, clip_on=False, zorder=5)
-
-
 def styles(names: Iterable[str], first: str | None = None) -> dict[str, Look]:
     """Colour and marker of each name; the first's colour is that of text."""
     found: dict[str, Look] = {first: {"color": INK, "marker": _MARKERS[0]}} if first else {}
@@ -331,14 +298,6 @@ def fitting(
     low, high = min([low, *beyond]), max([high, *beyond])
     room = _ROOM * (high - low) or 0.5
     return low - room, high + room
-
-
-def tilt(axes: Axes, _: object = None) -> None:
-    """Turn the names of columns, if they are too long to stand side by side."""
-    names = axes.get_xticklabels()
-    if len(names) * max(len(name.get_text()) for name in names) > _MOST_ACROSS:
-        for name in names:
-            name.set(rotation=30, ha="right", rotation_mode="anchor")
 
 
 def legend_below(figure: Figure, grid: Iterable[Axes]) -> None:

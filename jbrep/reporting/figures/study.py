@@ -5,6 +5,7 @@ from functools import partial
 from textwrap import fill
 from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
@@ -17,20 +18,18 @@ from jbrep.reporting.figures.panels import (
     Row,
     by,
     column,
-    draw_interval,
     fitting,
     line,
     panels,
     reference,
-    runs_and_mean,
     styles,
-    tilt,
 )
 from jbrep.reporting.findings import Findings, Group
 from jbrep.stats.claims import CLAIMS
 from jbrep.stats.runs import in_order
 
 _GROUP = ("task", "algorithm")
+_JITTER = 0.14  # between the outermost runs and the middle of their row
 _SPREAD = "SD over runs"
 _ENDS = ("value", "low", "high")
 _DASHED = " Dashed: policies that don't learn."
@@ -76,7 +75,9 @@ def _plot(
     for together in by(rows, *spec.together).values() if spec.values else ():
         values = [each for name in spec.values for each in column(together, name)]
         is_spread = _SPREAD in together[0].values()
-        values += [0, 3 * max(column(together, "mean"))] if is_spread else []  # for intervals
+        if is_spread:
+            most = 3 * max(column(together, "mean"))
+            values += [0, *column(together, "mean_high").clip(max=most)]
         ends, solved = [end for name in spec.ends for end in column(together, name)], list[float]()
         own = by(together, *spec.facet)
         for key in own if not is_spread else ():
@@ -111,14 +112,21 @@ def _agents(found: Findings) -> Iterator[tuple[Group, Any, dict[str, Any]]]:
 
 def _final(found: Findings) -> Iterator[Row]:
     """Each run's final return with the mean of all; and their spread."""
-    for _, each, key in _agents(found):
-        mean = dict(zip(("mean", "low", "high"), each.numbers["final_return_mean"], strict=True))
-        for seed, value in zip(each.seeds, each.by_run["final_return"], strict=True):
-            yield {**key, "number": "final return", "seed": seed, "value": value, **mean}
-    for _, each, key in _agents(found):
-        value, low, high = each.numbers["final_return_sd"]
-        spread = {"seed": None, "value": None, "mean": value, "low": low, "high": high}
-        yield {**key, "number": _SPREAD, **spread}
+    for group in found.groups:
+        key = {"task": group.task, "algorithm": group.algorithm}
+        for each in group.agents:
+            own = {**key, "representation": each.representation, "number": "final return"}
+            mean = _numbers("mean", each.numbers["final_return_mean"])
+            for seed, value in zip(each.seeds, each.by_run["final_return"], strict=True):
+                yield {**own, "seed": seed, "value": value, **mean}
+        for each in group.agents:
+            own = {**key, "representation": each.representation, "number": _SPREAD}
+            yield {
+                **own,
+                "seed": None,
+                "value": None,
+                **_numbers("mean", each.numbers["final_return_sd"]),
+            }
 
 
 def _curves(found: Findings) -> Iterator[Row]:
@@ -193,19 +201,35 @@ def _diagnosed(found: Findings) -> Iterator[Row]:
 # marks and panels of single plots
 
 
-def _difference(axes: Axes, rows: Sequence[Row], look: Look, name: str, place: int) -> None:
-    """An interval of 95 %, that of the test, and the boundary, in a row with a name."""
-    for ends, width in (
-        (("tested_low", "tested_high"), 0.8),
-        (("difference_low", "difference_high"), 2),
-    ):
-        values = [column(rows, each)[0] for each in ("difference", *ends)]
-        draw_interval(axes, "x", place, values, look, width)
+def _runs_and_mean(axes: Axes, rows: Sequence[Row], look: Look, _: str, place: int) -> None:
+    """A point for each run, and below them their mean with its interval, in a row."""
+    points = column(rows, "value")
+    apart = np.linspace(-_JITTER, _JITTER, len(points)) * (len(points) > 1)
+    axes.plot(points, place - 0.2 + apart, ".", color=look["color"], ms=4, alpha=0.6, mew=0)
+    _interval(axes, rows[0], "mean", look, 1.4, place + 0.2)
+
+
+def _difference(axes: Axes, rows: Sequence[Row], look: Look, _: str, place: int) -> None:
+    """The interval of the test, that of 95 %, and the boundary, in a row."""
+    tested = {f"difference_{end}": rows[0][f"tested_{end}"] for end in ("low", "high")}
+    _interval(axes, {**rows[0], **tested}, "difference", look, 0.8, place)
+    _interval(axes, rows[0], "difference", look, 2, place)
     axes.plot([rows[0]["boundary"]] * 2, [place - 0.45, place + 0.45], **reference())
-    before = [text.get_text() for text in axes.get_yticklabels()] if place else []
-    axes.set_yticks(range(place + 1), [*before, name])
-    axes.set_ylim(place + 0.6, -0.6)
-    axes.grid(visible=False, axis="y")
+
+
+def _interval(axes: Axes, row: Row, name: str, look: Look, width: float, place: float) -> None:
+    """A number between its low and high ends; triangles where it leaves the panel."""
+    value, low, high = np.array([row[name], row[f"{name}_low"], row[f"{name}_high"]], float)
+    left, right = axes.get_xlim()
+
+    def draw(at: Any, **how: Any) -> None:
+        axes.plot(np.clip(at, left, right), [place] * len(at), color=look["color"], **how)
+
+    draw([low, high], lw=width)
+    draw([value], marker=look["marker"], ms=4)
+    for edge, marker, is_cut in (left, "<", low < left), (right, ">", high > right):
+        if is_cut:
+            draw([edge], marker=marker, ms=3.5, mew=0, clip_on=False, zorder=5)
 
 
 def _training(axes: Axes, rows: Sequence[Row]) -> None:
@@ -234,16 +258,16 @@ _PLOTS = (
         "it, the standard deviation over runs. Bars: 95 % intervals, from four runs on; a triangle "
         "at an edge: the interval goes beyond it.",
         _final,
-        runs_and_mean("value", "mean", "low", "high"),
-        ("", "number"),
+        _runs_and_mean,
+        ("number", ""),
         facet=(*_GROUP, "number"),
         values=("value", "mean"),
-        ends=("low", "high"),
+        ends=("mean_low", "mean_high"),
         together=(*_GROUP, "number"),
         played=lambda group: {name: mean.value or 0.0 for name, mean in group.references.items()},
         more={
-            **{"title": lambda key: ", ".join(key[:2]), "across": 2, "height": 2.3},
-            "finish": tilt,
+            **{"title": lambda key: ", ".join(key[:2]), "across": 2},
+            **{"height": 0.6, "row": 0.2},
         },
     ),
     _Spec(
@@ -271,8 +295,8 @@ _PLOTS = (
         values=("difference", "difference_low", "difference_high", "boundary"),
         ends=("tested_low", "tested_high"),
         more={
-            **{"series": "claim", "colour": "representation", "limited": "x", "across": 1},
-            "wide": True,
+            **{"series": "claim", "colour": "representation", "across": 1},
+            **{"height": 0.6, "row": 0.16},
         },
     ),
     _Spec(
