@@ -281,6 +281,14 @@ def test_a_report_compares_with_the_study_s_baseline(whole, tmp_path):
     assert "gain on full" not in told
 
 
+def test_without_full_a_study_compares_with_its_first_representation():
+    claims = Rules(claims=("dae-8 not worse than pca-8",))
+    eight = {"representations": ("pca-8", "dae-8"), "seeds": tuple(range(8))}
+    study = STUDY.replace(**eight, verdicts=claims)
+    assert study.planned.rules.baseline == "pca-8"
+    assert study.planned.rules.chains.keys() == {("dae-8", "pca-8")}
+
+
 @pytest.mark.usefixtures("one_figure")
 def test_an_unfinished_study_says_what_is_missing(tmp_path):
     plan = make_study(tmp_path / "half", left=5)

@@ -358,7 +358,8 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     @property
     def planned(self) -> Planned:
         """What would reach verdicts, if the study were registered as it is."""
-        return Planned(self.verdicts, self.seeds, tuple(product(self.tasks, self.algorithms)))
+        rules = self.verdicts.replace(baseline=self.baseline)
+        return Planned(rules, self.seeds, tuple(product(self.tasks, self.algorithms)))
 
     @cached_property
     def observed(self) -> tuple[Representation, ...]:
