@@ -26,11 +26,11 @@ from jbrep.parameters import (
     GivenTask,
     Normalize,
     NumEnvs,
+    Observed,
     OptionalGivenTask,
     Overrides,
     Preset,
     Retries,
-    Seen,
     Threads,
     Workers,
     find_study,
@@ -95,10 +95,10 @@ class Agent(NamedTuple):
         what = f"{settings.learner} on {settings.representation}, {settings.task}"
         if self.record.status != FINISHED:
             return f"Agent({what}: {self.record.reason})"
-        told = "not played"
+        result = "not played"
         if len(self.returns):
-            told = mean_text(settings.environment, self.returns)
-        return f"Agent({what}: {told}; {str(self.folder)!r})"
+            result = mean_text(settings.environment, self.returns)
+        return f"Agent({what}: {result}; {str(self.folder)!r})"
 
 
 class Evaluated(NamedTuple):
@@ -141,7 +141,7 @@ def check(
     Args:
         data: a data set, or its folder, in place of a task.
         steps: total steps to play or read; of each policy at least four episodes are played.
-        seed: of episodes and of what is held out: the same one finds the same.
+        seed: of the episodes and the held-out split.
         write: a new features file, with names, units, ranges and kinds as found.
         out: a page with pictures for a browser, a new file.
     """
@@ -184,19 +184,19 @@ def collect(
 ) -> "Dataset":
     """Collect the states that a policy visits.
 
-    Repeat it to resume. A finished data set stays as it is; with more `steps` it is extended, to
-    the same data as if it had been made at once. The number of environments or threads doesn't
-    change the data. A robot that exists once needs `threads` 1. Whole shards are always kept. The
-    policy of a run is kept with the data as it is at the start, also if the run goes on.
+    Run it again to resume. More `steps` extend a finished data set, as if it had been made at once.
+    The number of environments or threads doesn't change the data. A robot that exists once needs
+    `threads` 1. Whole shards are always kept. A run's policy is copied at the start, so that later
+    training doesn't change the data.
 
     Args:
         task: whose environment is played; how readings that are missing are treated belongs to it.
         out: a folder: new, or with an unfinished or smaller data set of the same settings.
         policy: what acts: uniform, constant:drive=0.5, for the Jitterbug heuristic and trained (see
             jbrep policies), ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3; the folder of a run; or
-            several with weights, of which each episode has one: uniform:0.5+runs/a:0.5; or your
-            own: mymodule:act, a function of an observation, a class of such, or a model of
-            stable-baselines3.
+            several with weights, one of which plays each episode: uniform:0.5+runs/a:0.5; or your
+            own: mymodule:act, a function of an observation, a class of such functions, or a
+            stable-baselines3 model.
     """
     from jbrep.collecting.collector import collect as run
     from jbrep.collecting.collector import usual_shard_episodes
@@ -268,15 +268,15 @@ def train_encoders(
         out: a folder for the encoder files; a training that was stopped goes on from there.
         kind: one of dae, pca, slow, ...; jbrep train-encoder --help lists them with their settings.
         latent: sizes; empty for a kind that has none.
-        seeds: make so many of each, of the seeds from 0 on: NAME-s0, NAME-s1, ...
-        name: in files and tables; by default kind and size, such as dae-8.
-        preset: named settings; of dae: authors, its authors' own.
-        device: cpu, cuda, or auto.
+        seeds: encoders of each size, with seeds 0, 1, ...: NAME-s0, NAME-s1, ...
+        name: its name in files and tables; by default kind and size, such as dae-8.
+        preset: named settings; for dae: authors, its authors' own.
+        device: where to train: cpu, cuda, or auto.
         settings: of the kind, such as on="symmetry".
     """
-    from jbrep.methods.registry import each_named, with_preset
+    from jbrep.methods.registry import named_settings, with_preset
 
-    named = each_named(kind, latent, seeds, name, with_preset(kind, preset, settings))
+    named = named_settings(kind, latent, seeds, name, with_preset(kind, preset, settings))
     fitter = _fitter(data, out, device)
     for called, each in named:  # every mistake is reported before the first training
         fitter.plan(kind, name=called, **each)
@@ -296,9 +296,9 @@ def evaluate(
     Args:
         encoders: one, several, or several by names of yours: files, names of shipped ones, torch
             modules, functions.
-        data: that they are evaluated on.
+        data: the data set that they are evaluated on.
         out: a folder for evaluation.json; None to write nothing.
-        policy: that does the task well: a run's folder, or a policy by name; by default the
+        policy: one that does the task well: a run's folder or a policy's name; by default the
             task's scripted policy, if it has one.
         truth: the data set that `data` was derived from, with what it hides: how well an encoder
             estimates what isn't seen.
@@ -357,7 +357,7 @@ def train(
     *,
     algorithm: Algorithm = "sac",
     preset: Preset = "",
-    encoder: Seen = "full",
+    encoder: Observed = "full",
     seed: Seed = 0,
     overrides: Overrides = NOTHING,
     normalize: Normalize = False,
@@ -392,9 +392,10 @@ def train(
     from jbrep.envs.make import is_one_robot
     from jbrep.rl.presets import MODERN
 
-    for name in settings.keys() - TrainingSettings.__struct_fields__:
+    if unknown := [name for name in settings if name not in TrainingSettings.__struct_fields__]:
         raise InputError(
-            f"train has no {name!r}: give a setting of {algorithm} as overrides={{{name!r}: ...}}"
+            f"train has no {unknown[0]!r}: give a setting of {algorithm} as "
+            f"overrides={{{unknown[0]!r}: ...}}"
         )
     known = check_learner(task, algorithm, preset, encoder, begin_from)
     from jbrep.machine import cores
@@ -428,7 +429,7 @@ def clone(
     data: "Dataset | str | Path",
     out: str | Path,
     *,
-    encoder: Seen = "full",
+    encoder: Observed = "full",
     seed: Seed = 0,
     steps: TrainingSteps | None = None,
     overrides: Overrides = NOTHING,
@@ -439,10 +440,10 @@ def clone(
 ) -> Agent:
     """Learn a policy from a data set alone: clone the one that acted, or improve on it.
 
-    What is learned from 80 % of the episodes is evaluated on the others, by its actions. Cloning
-    keeps the epoch with the least held-out loss. Where the data's environment is here, the policy
-    plays it, beside the data's own returns. The result is a run's folder, for every command that
-    takes a policy. Repeat it to resume a training that was stopped.
+    It learns from 80 % of the episodes; its actions are tested on the rest. Cloning keeps the epoch
+    with the least held-out loss. Where the data's environment is installed, the policy plays it,
+    and its returns stand beside the data's. The result is a run's folder, for every command that
+    takes a policy. Run it again to resume.
 
     Args:
         data: a folder from jbrep collect or jbrep data import.
@@ -452,8 +453,8 @@ def clone(
         overrides: a setting of the network or its training, such as net_arch=[64,64],
             learning_rate=1e-3 or batch_size=512; of TD3+BC gamma, tau, policy_delay, ..., too; may
             be repeated.
-        episodes: to play, those that every run is evaluated on.
-        device: cpu, cuda, or auto.
+        episodes: episodes to play, the same for every run.
+        device: where to train: cpu, cuda, or auto.
         settings: method, loss, chunk, patience, alpha.
     """
     from jbrep.dataset import Dataset
@@ -516,12 +517,12 @@ def study(
     elif out:
         plan = Plan(study if isinstance(study, Study) else as_study(study), Path(out), None)
     else:
-        raise InputError("give out, the folder of the study")
+        raise InputError("give `out`, a folder for the study")
     run = choose(backend, BACKENDS, "backend")
     for notice in plan.study.notices:
         _note(notice)
     if crashed := run_study(plan, run, workers):
-        _note(f"{counted(crashed, 'run')} crashed: the same study in that folder tries again")
+        _note(f"{counted(crashed, 'run')} crashed: run the study again to retry")
     return report(plan.folder)
 
 
@@ -535,8 +536,8 @@ def report(
 
     Args:
         folder: of a study, of runs, or of the tables of a study.
-        evaluation: from jbrep evaluate, of encoders of these runs: its diagnostics go into the
-            tables. {task} in it stands for each task. May be repeated.
+        evaluation: an evaluation of these runs' encoders, from jbrep evaluate, to add to the
+            tables; {task} stands for each task. May be repeated.
         out: a folder for the report; by default the study's own.
     """
     from jbrep.records.storage import exists, make_folder
@@ -575,8 +576,8 @@ def _note_limits(settings: "RunSettings") -> None:
     is_seen = settings.representation == FULL and not settings.hyperparameters.normalize
     if is_seen and 0 < len(free) < len(features):
         _note(
-            f"{len(free)} of {len(features)} features have no usual range ({free[0]}, ...) and "
-            "aren't scaled, the others are: give ranges in a file of `features`, or `normalize`",
+            f"{len(free)} of {len(features)} features have no usual range ({free[0]}, ...), so "
+            "they alone aren't scaled: give ranges in a file of `features`, or `normalize`",
             level=4,
         )
     if not settings.environment.reproducible:

@@ -30,7 +30,7 @@ with mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8):
 """
 
 
-class Finding(NamedTuple):
+class Line(NamedTuple):
     """A line of the result."""
 
     what: str
@@ -38,20 +38,20 @@ class Finding(NamedTuple):
     is_wrong: bool = False  # a fault, not just a missing extra
 
 
-def examine() -> Iterator[Finding]:
+def examine() -> Iterator[Line]:
     """Describe the machine, then the packages of each extra."""
     where = f"Python {platform.python_version()}, {platform.platform()}"
-    yield Finding("jbrep", f"{version('jbrep')} on {where}")
-    yield Finding("cores", f"{cores()}: collect steps robots on all, a study has a run on each")
+    yield Line("jbrep", f"{version('jbrep')} on {where}")
+    yield Line("cores", f"{cores()}: collect steps robots on all, a study has a run on each")
     if hasattr(os, "sysconf"):  # not on Windows
-        yield Finding("memory", f"{memory() / 2**30:.0f} GiB")
+        yield Line("memory", f"{memory() / 2**30:.0f} GiB")
     with suppress(OSError):  # where this folder was deleted
         free = shutil.disk_usage(Path.cwd()).free
-        yield Finding("disk", f"{free / 2**30:.0f} GiB free here; 5 million states take 0.4 to 1.9")
-    yield Finding("GPU", _gpu())
-    yield Finding("OpenGL", _opengl())
+        yield Line("disk", f"{free / 2**30:.0f} GiB free here; 5 million states take 0.4 to 1.9")
+    yield Line("GPU", _gpu())
+    yield Line("OpenGL", _opengl())
     address = os.environ.get("RAY_ADDRESS")
-    yield Finding("Ray", address or "no RAY_ADDRESS: study --backend ray starts one of its own")
+    yield Line("Ray", address or "no RAY_ADDRESS: study --backend ray starts one of its own")
     for extra in ("", *extras()):
         yield _packages(extra)
 
@@ -77,7 +77,7 @@ def _opengl() -> str:
     return reason.partition("InputError: ")[2] or f"rendering fails: {reason}"
 
 
-def _packages(extra: str) -> Finding:
+def _packages(extra: str) -> Line:
     """Whether all requirements of an extra are installed, in versions that fit."""
     name, asked = extra or "core", [(each, _installed(each)) for each in _required(extra)]
     wrong = [
@@ -87,11 +87,11 @@ def _packages(extra: str) -> Finding:
     ]
     missing = [r.name for r, v in asked if not v]
     if not wrong and not missing:
-        return Finding(name, ", ".join(f"{r.name} {v}" for r, v in asked))
+        return Line(name, ", ".join(f"{r.name} {v}" for r, v in asked))
     problems = [*wrong, *([f"no {', '.join(missing)}"] if missing else [])]
     package = f"jbrep[{extra}]" if extra else "jbrep"
     said = f"{', '.join(problems)}: pip install '{package}'"
-    return Finding(name, said, is_wrong=bool(wrong) or not extra)
+    return Line(name, said, is_wrong=bool(wrong) or not extra)
 
 
 def _installed(requirement: Requirement) -> str:

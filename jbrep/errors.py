@@ -60,16 +60,16 @@ def refusing(
     what: str,
     errors: tuple[type[Exception], ...] = (Exception,),
     *,
-    told: Callable[[Any], str] = kind_and_line,
+    describe: Callable[[Any], str] = kind_and_line,
     kind: type[InputError] = InputError,
 ) -> Iterator[None]:
-    """Let errors of these classes be a user's mistake: what can't be, and why, told in a line."""
+    """Turn errors of these classes into a user's mistake: what failed, and why, in a line."""
     try:
         yield
     except InputError:
         raise
     except errors as error:
-        raise kind(f"{what}: {told(error)}") from error
+        raise kind(f"{what}: {describe(error)}") from error
 
 
 def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:

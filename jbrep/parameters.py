@@ -34,7 +34,7 @@ Retries = Annotated[
     Meta(
         ge=0,
         le=1_000_000,
-        description="How often in a row an environment that fails is made anew; not when it is "
+        description="Times in a row that a failing environment is recreated, except when it is "
         "first tried.",
     ),
 ]
@@ -96,7 +96,7 @@ Overrides = Annotated[
 Normalize = Annotated[
     bool, Meta(description="Normalise what the agent sees by its running mean and variance.")
 ]
-Seen = Annotated[
+Observed = Annotated[
     Any,
     Meta(
         description="What the agent observes: full, the scaled observation; coordinates, symmetry, "
@@ -127,8 +127,8 @@ def described(
         features: a TOML file with names, units, ranges, kinds and offsets of the features.
         missing: how to treat NaN and infinite readings: an episode ends before one, or the
             last one is held for at most N steps; otherwise they are errors.
-        action_bounds: of each number of an action, or of all, such as -1..1; they must be given
-            where the environment has none.
+        action_bounds: bounds of each action, or of all, such as -1..1; required where the
+            environment has none.
         step_timeout: seconds after which a reset or step that hasn't come back has failed, as of a
             robot that stalls.
     """

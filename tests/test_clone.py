@@ -12,7 +12,7 @@ from small import assert_same_files
 
 import jbrep
 from jbrep.cloning import clone as cloning
-from jbrep.cloning.objective import Seen
+from jbrep.cloning.objective import PolicyInputs
 from jbrep.collecting.derive import derive
 from jbrep.dataset import Dataset, Layout, from_table
 from jbrep.encoders import find
@@ -85,7 +85,7 @@ def test_one_that_learns_no_more_is_stopped_and_its_best_epoch_is_kept(home, log
 
 def test_it_sees_any_encoder_scaled_alike(home, log):
     encoder = jbrep.train_encoder(log, home / "encoders", "pca", latent=1)
-    seen = Seen(log, encoder)
+    seen = PolicyInputs(log, encoder)
     rows = seen.load(seen.train)
     assert rows.shape == (len(seen.train), 1)
     np.testing.assert_allclose([rows.mean(), rows.std()], [0, 1], atol=1e-5)
@@ -187,7 +187,7 @@ def upright(home):
 
 
 def test_what_follows_an_episode_is_what_was_seen_at_its_end(upright):
-    seen = Seen(upright, find("full", upright.task))
+    seen = PolicyInputs(upright, find("full", upright.task))
     windows = Windows(seen, seen.train)
     rows, ended = windows.after(windows.numbers)
     episodes = upright.episodes

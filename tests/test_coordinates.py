@@ -365,7 +365,7 @@ def test_what_fails_while_symmetry_is_tried_is_said_in_one_line(monkeypatch, cap
 
 def test_a_task_whose_features_say_nothing():
     plain = TASK.replace(features=[each.replace(kind="scalar", frame="") for each in TASK.features])
-    with pytest.raises(InputError, match="no features of which coordinates would be anything else"):
+    with pytest.raises(InputError, match="would be the observation"):
         make_coordinates(plain, "coordinates")
     with pytest.raises(InputError, match="symmetry has nothing to leave out"):
         make_coordinates(plain, "symmetry")

@@ -69,7 +69,7 @@ def test_a_environment_that_diverges_while_an_action_is_held_waits_for_the_other
     moved = [endless.step(np.ones((2, 1))) for _ in range(3)]
     assert [each.length.tolist() for each in moved] == [[4, 4], [8, 6], [12, 4]]
     assert [each.ended.tolist() for each in moved] == [[False] * 2, [False, True], [False] * 2]
-    assert moved[1].told(1) == {"control_steps": 6, "non_finite": True}
+    assert moved[1].end_info(1) == {"control_steps": 6, "non_finite": True}
 
 
 @pytest.fixture(scope="module")

@@ -44,6 +44,7 @@ from jbrep.studies.runner import register_study
 from jbrep.studies.tables import (
     REFERENCE_RETURNS,
     play_references,
+    run_of,
     write_tables,
 )
 
@@ -351,7 +352,6 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
     [
         ("runs.json", lambda text: text[:100], "runs.json is damaged"),
         ("runs.json", lambda text: text.replace('"2.13.0', '"2; touch P #'), "versions"),
-        ("returns.csv", lambda text: text.replace("full,3,1000", "full,3,0"), "episodes"),
         ("returns.csv", lambda text: text + "a,b,c,0,0,0,nan\n", "returns.csv is damaged"),
         ("references.csv", lambda text: text + "x", "references.csv is damaged"),
         ("runs.json", None, "runs.json"),
@@ -399,6 +399,17 @@ def check_close(ours, theirs):
         assert ours == pytest.approx(theirs, rel=1e-9)
     else:
         assert ours == theirs
+
+
+def test_a_run_without_a_curve_is_left_out(whole, tmp_path):
+    """Such as a policy that was cloned."""
+    copy_tables(whole, tmp_path)
+    raw = read_tables(tmp_path).raw
+    first = raw.record.runs[0]
+    others = [row for row in raw.returns if run_of(row) != (first.label, first.seed)]
+    found, refused = raw._replace(returns=others).curves()
+    assert len(found) == len(raw.record.runs) - 1
+    assert first.label in refused[0]
 
 
 def test_references_of_an_environment_that_is_not_here_stay(tmp_path, monkeypatch):

@@ -194,7 +194,7 @@ LIKE = drawn(901, 30, 20, 6)
 
 def test_claims_are_tested_in_their_order():
     found = verdicts(FULL, BETTER, margin=0.2)  # as of twenty runs a seventh may fail, unseen
-    assert [verdict.sentence for verdict in found] == [*KEPT]
+    assert [f"{v.x} {v.claim} than {v.y}" for v in found] == [*KEPT]
     assert words(found) == ["supported"] * 3
     kept, ratio, earlier = found
     assert kept.interval.low > kept.boundary == pytest.approx(-0.2 * (950 - 250))
@@ -260,6 +260,20 @@ def test_there_is_no_verdict_before_all_planned_runs_have_ended():
     assert words(found) == ["undecided"] * 3
     assert {each.reason for each in found} == {"9 of 20 runs on dae-12 have ended"}
     assert np.isnan(found[0].estimate.value)
+
+
+def test_a_verdict_depends_on_no_other_representation():
+    """Where no least return is known, a failed run counts as the worst of the two."""
+    full, other, worse = (
+        arm(name, drawn(mean, 9, 32, len(name)), return_floor=None)
+        for name, mean in (("full", 500), ("dae-12", 800), ("pca-4", -9000))
+    )
+    other[3] = replace(other[3], failed_at=90_000)
+    claims, found = ("dae-12 better than full",), []
+    for others in ((), (("pca-4", worse),)):
+        found += verdicts(full, other, claims, others)
+    assert found[0] == found[1]
+    assert found[0].estimate.value > 200
 
 
 @pytest.mark.parametrize(

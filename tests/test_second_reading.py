@@ -12,11 +12,14 @@ from gymnasium.spaces import Box
 from small import brief as settings
 from small import write_again
 
+from jbrep.collecting.policies import Heuristic
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.manifest import find_problems, open_shard
 from jbrep.envs import describe
+from jbrep.envs.autoreset import AutoresetEnvironments
 from jbrep.envs.environments import Environments
 from jbrep.errors import STEP_TIMEOUT, InputError
+from jbrep.play.references import policies_of
 from jbrep.records.record import from_plain
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.overrides import overridden
@@ -27,7 +30,7 @@ OPTIONS = ("--task", "Pendulum-v1", "--episode-steps", 20)
 
 
 class Slow(gymnasium.Env):
-    """Its steps take 30 ms."""
+    """Its steps take 30 ms, and return their action; above 0.6 a reading is lost."""
 
     observation_space, action_space = Box(-1, 1, (2,)), Box(-1, 1, (1,))
 
@@ -37,7 +40,8 @@ class Slow(gymnasium.Env):
 
     def step(self, action):
         time.sleep(0.03)
-        return np.zeros(2, np.float32), 0.0, False, False, {}
+        reading = np.float32(np.nan if action[0] > 0.6 else 0)
+        return np.full(2, reading), float(action[0]), False, False, {}
 
 
 gymnasium.register("SecondReading/Slow-v0", Slow, max_episode_steps=5)
@@ -106,6 +110,7 @@ def test_ranges_and_lengths_are_verified(brief, tmp_path):
         ("final_observations", ["a", "b"]),
         ("episodes/terminated", ["a", "b"]),
         ("episodes/terminated", [np.nan, 0]),
+        ("seeds", np.ones((2, 2), int)),
     ],
 )
 def test_an_npz_with_something_else(name, value, tmp_path):
@@ -115,6 +120,8 @@ def test_an_npz_with_something_else(name, value, tmp_path):
         "episode": [0, 0, 1, 1],
         "final_observations": np.zeros((2, 3)),
         "version": 3,  # which no column can be
+        "seeds": np.ones((2, 1), int),
+        "long": np.zeros(4, np.longdouble),
     }
     path = tmp_path / "some.npz"
     told = ("data", "import", path, "--task", "Pendulum-v1", "--out")
@@ -144,6 +151,41 @@ def test_statistics_are_of_what_a_policy_sees():
 def test_json_stays_json_beside_another_policy():
     command = ("evaluate-policy", "still", *OPTIONS, "--episodes", 1, "--beside", "uniform")
     assert json.loads(jbrep(*command, "--json").stdout)["episodes"] == 1
+
+
+def test_a_scripted_policy_sees_the_whole_state():
+    seen = describe("face_direction", hide=("velocity",), history=2).replace(name="face_direction")
+    assert "scripted" not in policies_of(seen)
+    assert "scripted" in refused(Heuristic().begin, seen, [0])
+
+
+def test_a_claim_may_be_tested_at_levels_that_others_pass_on():
+    claims = [f"full-standard {claim} than full" for claim in ("better", "less variable")]
+    seven = {"tasks": [f"Robot-v{i}" for i in range(7)], "seeds": 8, "verdicts": {"claims": claims}}
+    assert as_study({**STUDY, **seven, "representations": ["full", "full-standard"]}).units
+
+
+def test_a_lost_step_has_the_reward_before_it():
+    envs = AutoresetEnvironments(describe("SecondReading/Slow-v0", missing="skip"), 1)
+    envs.reset([0])
+    steps = [envs.step(np.full((1, 1), each)) for each in (0.5, -0.5, 0.7)]
+    assert [each.reward.item() for each in steps] == [0.5, -0.5, -0.5]
+    assert [each.ended.item() for each in steps] == [False, False, True]
+
+
+def test_rewards_of_ones_own_stay_known(brief, tmp_path, monkeypatch):
+    (tmp_path / "paid.py").write_text(
+        "def reward(observations, actions):\n    return actions[:, 0]\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    jbrep("data", "derive", brief, "--reward", "paid:reward", "--out", tmp_path / "own")
+    for to, name in (("parquet", "own.parquet"), ("minari", "sets")):
+        jbrep("data", "export", tmp_path / "own", "--to", to, "--out", tmp_path / name)
+    (stored,) = (tmp_path / "sets").rglob("data")
+    for given in (tmp_path / "own.parquet", stored):
+        out = tmp_path / given.name / "imported" if given is stored else tmp_path / "imported"
+        jbrep("data", "import", given, "--out", out)
+        assert Dataset(out).manifest.settings.reward.startswith("paid:reward ")
 
 
 def test_a_history_too_long_is_named():

@@ -144,7 +144,8 @@ UNSEEN = {"steps": NONE, "returns": np.ones((0, 1)), "failed_at": 0, "return_flo
         ([*TWO, make(seed=2, settings="b2")], "settings a1, b2"),
         ([make("dae-8", 0), make("dae-8", 1)], "baseline 'full'"),
         ([*TWO, make(seed=2, environment="Robot-v0, body=5")], "different environments"),
-        ([*TWO, make(seed=2, returns=np.ones((11, 2)))], "episodes: report those of one"),
+        ([*TWO, make("dae-8", seed=2, learner="b2")], "different learners"),
+        ([*TWO, make(seed=2, returns=np.ones((11, 2)))], "episodes: report runs"),
         ([make(seed=i, **UNSEEN) for i in range(2)], "failed before its first evaluation"),
         (
             [*TWO, make(seed=2, steps=np.array([10_000, 12_000]), total_steps=12_000)],
@@ -202,10 +203,11 @@ def test_what_gains_count_over_is_of_the_starts_of_runs_that_were_evaluated():
     runs = [make(seed=i, returns=np.full((len(GRID), 5), 300.0)) for i in range(3)]
     early = make(seed=0, steps=NONE, returns=np.ones((0, 1)), failed_at=0)
     played = {"face_direction": {"random": [900.0, 0, 0, 0, 0]}}
-    (group,) = analyse(
-        [early, *(replace(run, seed=run.seed + 1) for run in runs)], references=played
-    ).groups
-    assert group.references["random"].value == 180
+    later = [replace(run, seed=run.seed + 1) for run in runs]
+    ends = [replace(make(seed=i), final=np.full(5, 300.0)) for i in (1, 2)]
+    for known in ([early, *later], [make(seed=0, steps=GRID[:5], failed_at=3500), *ends]):
+        (group,) = analyse(known, references=played).groups
+        assert group.references["random"].value == 180
 
 
 def test_scalars_of_a_straight_line():

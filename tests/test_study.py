@@ -313,7 +313,7 @@ def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.reporting.report.write_report", lambda found, out: [out])
     told = jbrep("study", path, "--out", out)
     assert told.exit_code == 1
-    assert "Note: 1 run crashed: the same study in that folder tries again\n" in told.stderr
+    assert "Note: 1 run crashed: run the study again to retry\n" in told.stderr
 
 
 MIXED = (

@@ -257,8 +257,7 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     data = {"": Data(folder=str(collected))}
     study = with_own(nested, files, own, seeds=(0, 1, 2, 3, 4), data=data)
     assert study.notices[:2] == [
-        f"The seeds, 5 in number, share the 2 encoders of {name} unevenly."
-        for name in ("random-4", "mine")
+        f"5 seeds share the 2 encoders of {name} unevenly." for name in ("random-4", "mine")
     ]
     plan = Plan(study, tmp_path / "it")
     prepare(plan)

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec.structs import asdict
 
 from jbrep.checking.features import TURNS, Finding, Shapes
-from jbrep.checking.seen import Seen
+from jbrep.checking.transitions import Transitions
 from jbrep.coordinates import make_coordinates
 from jbrep.envs.description import describe
 from jbrep.envs.names import modules_of, spec_of
@@ -23,8 +23,8 @@ from jbrep.errors import InputError
 from jbrep.records.document import toml_text
 
 # what a features file says
-_OF_TASK = "timestep", "reward_low", "reward_high", "solved_return"  # in a features file
-_told = attrgetter("features", "offsets", *_OF_TASK)
+_OF_TASK = "timestep", "reward_low", "reward_high", "solved_return"
+_declared = attrgetter("features", "offsets", *_OF_TASK)
 _USUAL = 0.01, 0.99  # quantiles of what was seen: a usual range, where none is known
 
 
@@ -38,7 +38,7 @@ class Advice(NamedTuple):
 
 
 def advise(
-    seen: Seen,
+    seen: Transitions,
     shapes: Shapes,
     findings: Sequence[Finding],
     is_symmetric: bool,
@@ -47,14 +47,16 @@ def advise(
 ) -> Advice:
     """Choose a representation for what was found, and write its command.
 
-    Their file stands `where`, `data` is the folder that was read.
+    `where` is the features file that was written, `data` the folder that was read.
     """
     task, features = seen.task, _found(seen, shapes)
     own = None if data else _own(task)
-    as_given = task.whole if data else own or _own(task, _bounds(task)) or task.whole
+    baseline = task.whole if data else own or _own(task, _bounds(task)) or task.whole
     kinds = [[(e.name, e.kind, e.frame) for e in some] for some in (features, task.whole.features)]
     scales = any(each.kind == "scales" for each in findings)
-    use_file = bool(where or kinds[0] != kinds[1] or _told(task.whole) != _told(as_given) or scales)
+    use_file = bool(
+        where or kinds[0] != kinds[1] or _declared(task.whole) != _declared(baseline) or scales
+    )
     known = task.whole.replace(features=features) if use_file else task.whole
     hidden = [*(task.view.hidden if task.view else ())]
     for each in findings:
@@ -70,28 +72,28 @@ def advise(
     if data is None:
         file = [f"--features={where or 'features.toml'}"] * use_file
         given = [*_given(task, own), *file, *view]
-        lines = [["rl", *given, "--encoder", system, "--out", "runs/first"]]
+        commands = [["rl", *given, "--encoder", system, "--out", "runs/first"]]
         if use_file and not where:
-            lines.insert(0, ["check", *_given(task, own)[1:], "--write", "features.toml"])
+            commands.insert(0, ["check", *_given(task, own)[1:], "--write", "features.toml"])
     else:
-        again = f"{data}-seen" if view else str(data)
-        lines = [["data", "derive", str(data), *view, "--out", again]] if view else []
-        lines += [["train-encoder", "--kind", system, "--data", again, "--out", "encoders"]]
-    command = "\n".join(shlex.join(["jbrep", *each]) for each in lines)
+        derived = f"{data}-seen" if view else str(data)
+        commands = [["data", "derive", str(data), *view, "--out", derived]] if view else []
+        commands += [["train-encoder", "--kind", system, "--data", derived, "--out", "encoders"]]
+    command = "\n".join(shlex.join(["jbrep", *each]) for each in commands)
     return Advice(system, why, command, features)
 
 
 def _given(task: Task, own: Task | None) -> list[str]:
     """What names a task on a command line, with what its `own` environment doesn't say."""
-    made = ["--task", task.name.removesuffix(task.view.suffix if task.view else "")]
-    made += [f"--import={each}" for each in modules_of(task)]
-    made += [f"--env={each}" for each in task.given_arguments]
+    options = ["--task", task.name.removesuffix(task.view.suffix if task.view else "")]
+    options += [f"--import={each}" for each in modules_of(task)]
+    options += [f"--env={each}" for each in task.given_arguments]
     if spec_of(task).max_episode_steps != task.max_episode_steps:
-        made.append(f"--episode-steps={task.max_episode_steps}")
+        options.append(f"--episode-steps={task.max_episode_steps}")
     if own is None or _bounds(own) != _bounds(task):
         bounds = [f"{a:.9g}..{b:.9g}" for a, b in _bounds(task)]
-        made.append(f"--action-bounds={','.join(bounds if len({*bounds}) > 1 else bounds[:1])}")
-    return made + [f"--missing={task.missing}"] * bool(task.missing)
+        options.append(f"--action-bounds={','.join(bounds if len({*bounds}) > 1 else bounds[:1])}")
+    return options + [f"--missing={task.missing}"] * bool(task.missing)
 
 
 def _own(task: Task, bounds: Bounds = ()) -> Task | None:
@@ -123,7 +125,7 @@ def _system(task: Task, winds: bool) -> tuple[str, str]:
     return "full", "no feature is known to jump or wind"
 
 
-def _found(seen: Seen, shapes: Shapes) -> tuple[Feature, ...]:
+def _found(seen: Transitions, shapes: Shapes) -> tuple[Feature, ...]:
     """All features that the environment gives, with what was found of those that are seen."""
     task, before = seen.task, ""
     places = {name: i for i, name in enumerate(task.feature_names)}
@@ -144,7 +146,7 @@ def _found(seen: Seen, shapes: Shapes) -> tuple[Feature, ...]:
     return tuple(made)
 
 
-def _as_seen(feature: Feature, seen: Seen, shapes: Shapes, i: int) -> Feature:
+def _as_seen(feature: Feature, seen: Transitions, shapes: Shapes, i: int) -> Feature:
     turn = shapes.turns.get(i)
     if turn and turn[:2] in TURNS[:2] and feature.kind == "scalar":
         low, high = turn.low, turn.low + turn.size
@@ -164,8 +166,10 @@ def features_toml(task: Task, features: Sequence[Feature], findings: Sequence[Fi
     known = {name: getattr(task, name) for name in _OF_TASK}
     lines.append(toml_text({k: v for k, v in known.items() if v is not None}).rstrip())
     for old, new in zip(task.whole.features, features, strict=True):
-        told = [f"# {each.kind}: {each.evidence}" for each in findings if old.name in each.features]
+        comments = [
+            f"# {each.kind}: {each.evidence}" for each in findings if old.name in each.features
+        ]
         every = {**asdict(new), "offset": (task.offsets or {}).get(old.name)}
         said = {k: v for k, v in every.items() if v is not None and v is not False and v != ""}
-        lines += ["", *told, "[[features]]", toml_text({"unit": "", **said}).rstrip()]
+        lines += ["", *comments, "[[features]]", toml_text({"unit": "", **said}).rstrip()]
     return "\n".join(lines) + "\n"

@@ -9,7 +9,7 @@ import numpy as np
 from jbrep.checking.advice import Advice, advise, features_toml
 from jbrep.checking.features import WORST_FIRST, Finding, Shapes, shapes
 from jbrep.checking.relations import Relations
-from jbrep.checking.seen import REPEATS, Played, Seen, play, read
+from jbrep.checking.transitions import REPEATS, PlayStats, Transitions, play, read
 from jbrep.coordinates.invariance import NotTheSameError, tried_coordinates
 from jbrep.dataset import Dataset
 from jbrep.envs.task import Task
@@ -42,9 +42,9 @@ class Check(NamedTuple):
     findings: list[Finding]  # worst first
     advice: Advice
     notes: list[str]  # what wasn't asked, and why
-    seen: Seen
+    seen: Transitions
     shapes: Shapes
-    played: Played | None  # None of data
+    played: PlayStats | None  # None of data
 
     def __repr__(self) -> str:
         return self.text(terminal_width())
@@ -129,11 +129,11 @@ class Check(NamedTuple):
         held = ", ".join(f"{repeat} (x{each:.2g})" for repeat, each in spread.items())
         far = [repeat for repeat, each in spread.items() if each >= 0.9 * max(spread.values())]
         advice = f"; try --set action_repeat={far[0]}" if far and spread[far[0]] > _FAR else ""
-        told = (
+        growth = (
             f"growth of a feature's spread, at most, by steps that actions are held: {held}{advice}"
         )
         return {
-            "holding": told if spread else "random actions of one step each move nothing",
+            "holding": growth if spread else "random actions of one step each move nothing",
             "reproducible": "yes" if self.seen.task.reproducible else "no",
             "speed": f"{rate:,.0f} steps/s here: 1M steps take {duration(1e6 / rate)} of play",
         }
@@ -151,7 +151,7 @@ def check_data(data: Dataset, steps: int, seed: int, where: Path | None = None) 
 
 
 def _check(
-    seen: Seen, seed: int, where: Path | None, played: Played | None, data: Path | None
+    seen: Transitions, seed: int, where: Path | None, played: PlayStats | None, data: Path | None
 ) -> Check:
     known, findings = shapes(seen)
     notes, is_turned, is_symmetric = [] if played else [_NOT_PLAYED], False, False
@@ -178,12 +178,12 @@ def _by_turning(task: Task) -> tuple[list[Finding], bool]:
     if not any(each.frame == "world" or each.kind == "quaternion" for each in task.features):
         return [], False
     try:
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             made = tried_coordinates(task, "symmetry")
     except InputError as error:
         return [], isinstance(error, NotTheSameError)
-    if told or not made:  # all rewards were the same, which tells nothing
+    if caught or not made:  # all rewards were the same, which tells nothing
         return [], False
     why = "turned by a quarter and shifted, the robot goes on and is rewarded alike"
     fix = "--encoder symmetry leaves out place and heading"

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jbrep.checking.seen import RANDOM, Seen
+from jbrep.checking.transitions import RANDOM, Transitions
 from jbrep.envs.task import Array
 
 WORST_FIRST = {  # kinds of findings
@@ -31,7 +31,7 @@ TURNS = (
     (-180.0, 360.0),
     (0.0, 360.0),
 )  # from, by; in rad first
-_ROOM, _WIDE, _CALM = 0.02, 0.8, 0.3  # of a turn: beyond its ends, jumps, nearly all other steps
+_ROOM, _WIDE, _CALM = 0.02, 0.8, 0.3  # shares of a turn: margin at its ends, jumps, other steps
 _FEWEST_JUMPS, _FEWEST_VALUES = 3, 20  # of what has another range
 _FLAT, _ROUNDING = 1e-9, 1e-5  # of a feature's magnitude, of the deviation of a copy
 _AT_BOUND = 0.1  # share of rows that are exactly at the least or greatest value
@@ -83,7 +83,7 @@ def several(names: Sequence[str], before: str = "", between: str = ", ") -> str:
     return between.join(f"{before}{name}" for name in names[:_SHOWN]) + more
 
 
-def shapes(seen: Seen) -> tuple[Shapes, list[Finding]]:
+def shapes(seen: Transitions) -> tuple[Shapes, list[Finding]]:
     """What the features are like, and what of that is to be changed."""
     before, features = seen.before, seen.task.features
     flips = dict(_flips(before, seen.after))
@@ -135,7 +135,7 @@ def turn_of(before: Array, after: Array, is_known: bool = False) -> Turn | None:
     return None
 
 
-def _wraps(seen: Seen, i: int, turn: Turn) -> Finding:
+def _wraps(seen: Transitions, i: int, turn: Turn) -> Finding:
     feature, low, high = seen.task.features[i], turn.low, turn.low + turn.size
     why = (
         f"jumps between {low:.4g} and {high:.4g} in {turn.jumps:,} of {len(seen.before):,} steps; "
@@ -155,7 +155,7 @@ def _wraps(seen: Seen, i: int, turn: Turn) -> Finding:
     return Finding("wraps", (feature.name,), why, fix, turn._asdict())
 
 
-def _winds(seen: Seen, i: int) -> Finding | None:
+def _winds(seen: Transitions, i: int) -> Finding | None:
     feature, low, high = seen.task.features[i], seen.before[:, i].min(), seen.before[:, i].max()
     if not feature.is_angle or high - low <= 2 * np.pi * (1 + _ROOM):
         return None
@@ -181,7 +181,7 @@ def _flips(before: Array, after: Array) -> Iterator[tuple[int, int]]:
         i += 4 if is_unit else 1
 
 
-def _signs(seen: Seen, first: int, count: int) -> Finding:
+def _signs(seen: Transitions, first: int, count: int) -> Finding:
     why = f"of unit length; all four change signs in {count:,} of {len(seen.before):,} steps"
     known = seen.task.features[first].kind == "quaternion"
     say = "" if known else 'features.toml: kind = "quaternion", if in the order w, x, y, z; then '
@@ -204,7 +204,7 @@ def _copies(rows: Array, own: Sequence[int]) -> dict[int, tuple[int, float]]:
     return found
 
 
-def _degrees(seen: Seen, i: int) -> Finding | None:
+def _degrees(seen: Transitions, i: int) -> Finding | None:
     feature, largest = seen.task.features[i], float(np.abs(seen.before[:, i]).max())
     is_named = _DEGREES.search(feature.name) or _DEGREES.search(feature.unit)
     is_angle = _ANGLE.search(feature.name) and not feature.unit and 2.1 * np.pi < largest <= 361
@@ -214,7 +214,7 @@ def _degrees(seen: Seen, i: int) -> Finding | None:
     return Finding("degrees", (feature.name,), why, _in_radians(feature.name), {"most": largest})
 
 
-def _saturated(seen: Seen, i: int) -> Finding | None:
+def _saturated(seen: Transitions, i: int) -> Finding | None:
     rows = seen.after[np.char.startswith(seen.policy, RANDOM), i]  # others push all the time
     values, counts = np.unique(rows, return_counts=True)
     ends = {float(values[at]): counts[at] / len(rows) for at in (0, -1) if values[at]}
@@ -228,7 +228,7 @@ def _saturated(seen: Seen, i: int) -> Finding | None:
     )
 
 
-def _scales(seen: Seen, places: Sequence[int]) -> Iterator[Finding]:
+def _scales(seen: Transitions, places: Sequence[int]) -> Iterator[Finding]:
     """Of features without a usual range, which nothing scales where they are seen as they are."""
     features = [seen.task.features[i] for i in places]
     free = [at for at, each in enumerate(features) if each.low is None or each.high is None]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from jbrep.checking.features import Finding, Shapes, several
-from jbrep.checking.seen import Seen
+from jbrep.checking.transitions import Transitions
 from jbrep.coordinates.formulas import FORMULAS
 from jbrep.dataset.scaled import sample
 from jbrep.envs.task import Array
@@ -25,7 +25,7 @@ _FEWEST_EPISODES, _BLOCKS = 8, 20
 _GAIN, _SURE_GAIN = 0.1, 0.03  # of R^2 by a history: the least, and between the intervals
 _LEFT = 0.6  # of the error: what a history leaves, at most
 _OF_ACTIONS = 0.7  # of that gain by past actions alone, where they explain it
-_HARDLY, _MOSTLY, _KNOWN, _SPARE = 0.1, 0.5, 0.8, 0.02  # R^2
+_HARDLY, _MOSTLY, _KNOWN, _SPARE = 0.1, 0.5, 0.8, 0.02  # R^2: bounds of such words; a margin
 _LOSS = 0.01  # of R^2, that what is left out may cost
 _DEPENDS = 0.003, 2.0  # error by a shuffled feature: share of variation, times the error before
 _SLOW, _ENDS = 0.2, 0.2  # change of a place by its deviation; share of ends at extreme values
@@ -35,7 +35,7 @@ _SPARSE, _SMALL = 0.05, 0.01  # share of steps whose reward differs by this shar
 class Relations:
     """Regressions on what was seen, of features without jumps, each known once."""
 
-    def __init__(self, seen: Seen, shapes: Shapes, seed: int):
+    def __init__(self, seen: Transitions, shapes: Shapes, seed: int):
         self._seen, self._shapes, self._random = seen, shapes, np.random.default_rng(seed)
         features = seen.task.features
         firsts = (place.start for place in seen.task.groups.values())
@@ -110,24 +110,22 @@ class Relations:
     # regressions
 
     def _fit(self, *problems: tuple[Array, Array]) -> list[Predictor]:
-        """Ridge regressions, and networks of what these leave, the last column's its own."""
+        """Ridge regressions plus networks fitted to their residuals; the last column its own."""
         from sklearn.linear_model import Ridge  # not at the top: it takes seconds
         from sklearn.pipeline import make_pipeline
         from sklearn.preprocessing import StandardScaler
 
         rows = [(given[self._train], wanted[self._train]) for given, wanted in problems]
         models = [make_pipeline(StandardScaler(), Ridge()).fit(x, y) for x, y in rows]
-        lines = [lambda x, m=each: m.predict(x).reshape(len(x), -1) for each in models]
-        left = [y - line(x) for (x, y), line in zip(rows, lines, strict=True)]
-        parts = [np.hsplit(each, [-1]) if each.shape[1] > 1 else [each] for each in left]
-        problems_of = [
-            [Problem(x, y) for y in own] for (x, _), own in zip(rows, parts, strict=True)
-        ]
-        networks = iter(fit([*chain(*problems_of)]))
-        rests = [beside(*islice(networks, len(own))) for own in parts]
+        ridges = [lambda x, m=each: m.predict(x).reshape(len(x), -1) for each in models]
+        residuals = [y - ridge(x) for (x, y), ridge in zip(rows, ridges, strict=True)]
+        parts = [np.hsplit(each, [-1]) if each.shape[1] > 1 else [each] for each in residuals]
+        inputs = [x for (x, _), ys in zip(rows, parts, strict=True) for _ in ys]
+        networks = iter(fit([*map(Problem, inputs, chain(*parts))]))
+        corrections = [beside(*islice(networks, len(ys))) for ys in parts]
         return [
-            lambda x, line=line, rest=rest: line(x) + rest(x)  # type: ignore[misc]
-            for line, rest in zip(lines, rests, strict=True)
+            lambda x, ridge=ridge, network=network: ridge(x) + network(x)  # type: ignore[misc]
+            for ridge, network in zip(ridges, corrections, strict=True)
         ]
 
     @cached_property
@@ -137,8 +135,8 @@ class Relations:
         made = self._fit(*((self._given[name], self._targets[0]) for name in names))
         return dict(zip(names, made, strict=True))
 
-    def _told(self, name: str) -> Array:
-        """What is predicted of the rows that are held out."""
+    def _predicted(self, name: str) -> Array:
+        """Predictions for the held-out rows."""
         return self._predictors[name](self._given[name][self._test])
 
     def _scores(self, predicted: Array, wanted: Array) -> list[Score]:
@@ -166,7 +164,7 @@ class Relations:
             why = f"it differs from {usual:.4g} in {share:.2%} of the steps"
             fix = "shape it, as by the distance that is left, or explore by a policy that gets some"
             return Finding("sparse", (), why, fix, {"share": share})
-        whole, alone = (self._r2(self._told(name), wanted)[-1] for name in ("now", "action"))
+        whole, alone = (self._r2(self._predicted(name), wanted)[-1] for name in ("now", "action"))
         numbers = {"r2": whole, "r2_of_action": alone}
         if whole < _HARDLY or (alone > _KNOWN and whole - alone < _SPARE):
             why = f"observation and action predict its rank with an R² of {whole:.2f}, "
@@ -177,9 +175,9 @@ class Relations:
 
     def _of_history(self) -> Finding | None:
         wanted, places = self._targets
-        told = [self._told("now"), self._told("all")]
-        now, past = (self._r2(each, wanted) for each in told)
-        ends = zip(*(self._scores(each, wanted) for each in told), strict=True)
+        predictions = [self._predicted("now"), self._predicted("all")]
+        now, past = (self._r2(each, wanted) for each in predictions)
+        ends = zip(*(self._scores(each, wanted) for each in predictions), strict=True)
         apart = np.array([(after.low or 0) - max(before.high or 0, 0) for before, after in ends])
         is_hit = (past - now > _GAIN) & (apart > _SURE_GAIN) & (1 - past < _LEFT * (1 - now))
         hits = np.flatnonzero(is_hit).tolist()
@@ -221,7 +219,7 @@ class Relations:
     def _unneeded(self) -> Finding | None:
         """Places and headings that neither the reward nor the change of other features needs."""
         wanted, places = self._targets
-        present = self._r2(self._told("now"), wanted)
+        present = self._r2(self._predicted("now"), wanted)
         if places[-1:] != [-1] or present[-1] < _KNOWN:
             return None
         owners = self.inputs(self._seen.before[:1])[1]

@@ -47,8 +47,8 @@ def _notices() -> Iterator[None]:
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if issubclass(category, Notice):
-            told = with_its_options(str(message), click.get_current_context(silent=True))
-            say(noted(told), err=True)
+            text = with_its_options(str(message), click.get_current_context(silent=True))
+            say(noted(text), err=True)
         else:
             usual(message, category, *where, **options)
 

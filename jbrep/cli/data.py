@@ -40,10 +40,10 @@ def _check(as_json: AsJson = False, **options: Annotated[Any, api.check]) -> Non
     file = click.get_current_context().params.get("features")
     kinds = [[e.kind for e in t] for t in (found.advice.features, found.seen.task.whole.features)]
     if file and not options.get("write"):
-        word, command = shlex.quote(f"--features={file}"), found.advice.command
-        if kinds[0] == kinds[1]:  # nothing to write
-            command = command.split("\n")[-1].replace("--features=features.toml", word)
-        command = command.replace(" --write", f" {word} --write")
+        option, command = shlex.quote(f"--features={file}"), found.advice.command
+        if kinds[0] == kinds[1]:  # the file needs no change
+            command = command.split("\n")[-1].replace("--features=features.toml", option)
+        command = command.replace(" --write", f" {option} --write")
         found = found._replace(advice=found.advice._replace(command=command))
     say_json(found.plain()) if as_json else say(found.text(terminal_width()))
     for what, path in (("features file", options.get("write")), ("page", options.get("out"))):
@@ -139,15 +139,15 @@ def derive(
     history: History = 1,
     reward: Annotated[str, Meta(extra={"metavar": "MODULE:FUNCTION", "is_code": True})] = "",
 ) -> None:
-    """Make another data set of the same motion, with other rewards, or less or more to see.
+    """Make another data set of the same motion, with other rewards, hidden features or a history.
 
     `hide` leaves features out, `history` adds those of the steps before, and the actions since: an
     encoder of these estimates what can't be measured. `reward` is a function of your own, of what
     is seen before anything is hidden.
 
     Args:
-        reward: for rewards (n,) of the observations (n, d) and actions (n, k) of an episode; is
-            run.
+        reward: a function of an episode's observations (n, d) and actions (n, k) that returns
+            rewards (n,); it is run.
     """
     from jbrep.collecting.derive import derive as run
     from jbrep.envs.names import is_code
@@ -202,19 +202,19 @@ def import_data(
     columns = {n: options.pop(n) for n in Layout.__struct_fields__ if n in options}
     known = _layout(layout, columns)
     reward = known.reward if is_code(known.reward) else ""
-    told = {name: options[name] for name in ("features", "missing") if name in options}
+    declared = {name: options[name] for name in ("features", "missing") if name in options}
     if "task" not in options:
         if {"hide", "history"} & {*options}:
             raise InputError(
                 "--hide and --history need a --task here: import without them, and give them to "
                 "jbrep data derive"
             )
-        options = {name: each for name, each in options.items() if name not in told}
+        options = {name: each for name, each in options.items() if name not in declared}
     task = described(**options)
     with stoppable("nothing was imported"):
-        missing = told.get("missing") or (task.missing if task else "") or ""
+        missing = declared.get("missing") or (task.missing if task else "") or ""
         opened = open_sources(source, known, missing)
-        manifest = write(opened, out, task, **{} if task else told, reward=reward)
+        manifest = write(opened, out, task, **{} if task else declared, reward=reward)
     for note in opened.notes():
         say(note)
     for (noun, what), count in opened.changes().items():
@@ -232,8 +232,8 @@ def _layout(path: Path | None, given: dict[str, Any]) -> Layout:
     from jbrep.records.document import read_toml
     from jbrep.records.record import from_plain, to_plain
 
-    told = read_toml(path) if path else {}
+    from_file = read_toml(path) if path else {}
     try:
-        return from_plain({**told, **to_plain(given)}, Layout)
+        return from_plain({**from_file, **to_plain(given)}, Layout)
     except InputError as error:
         raise InputError(f"{path}: {error}" if path else f"{error}") from None

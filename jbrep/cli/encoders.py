@@ -88,8 +88,8 @@ def _tell_notes(
     tell(f"Evaluated: {'; '.join(taken)}.", err)
     if maybe := [label for label, seen in evaluation.seen.items() if seen == "maybe"]:
         tell(
-            f"Perhaps not new to these episodes: {', '.join(maybe)}, whose training data has the "
-            "same seed or isn't known.",
+            f"May have been trained on these episodes: {', '.join(maybe)} (training data of the "
+            "same seed, or unknown).",
             err,
         )
 
@@ -104,7 +104,7 @@ _COLUMNS = {  # by the names of diagnostics, those of the columns
 def list_shipped(*, task: TaskName = None) -> None:
     """Show which encoders ship, and how they were judged.
 
-    A dash stands for what isn't known; jbrep evaluate finds out.
+    A dash means unknown; jbrep evaluate measures it.
 
     Args:
         task: one of the Jitterbug's; all of them by default.
@@ -124,7 +124,7 @@ def list_shipped(*, task: TaskName = None) -> None:
         ]
         say(f"{name}\n{table(('encoder', 'l', *_COLUMNS.values()), rows, width)}\n")
     tell("Columns are R² on held-out episodes, and the error as a multiple of PCA's.")
-    tell("What the kinds of encoders are, jbrep train-encoder --help says.")
+    tell("jbrep train-encoder --help explains the kinds of encoders.")
 
 
 def _with_diagnostics(task: "Task") -> "list[tuple[str, Encoder, Values]]":
@@ -206,7 +206,7 @@ def _described(encoder: "BaseEncoder", source: str) -> dict[str, Any]:
     from jbrep.encoders import Encoder
 
     task = encoder.task
-    told = {
+    plain = {
         "name": encoder.name,
         "source": source,
         "task": task.name,
@@ -217,11 +217,11 @@ def _described(encoder: "BaseEncoder", source: str) -> dict[str, Any]:
         "latent_size": encoder.latent_size,
     }
     if not isinstance(encoder, Encoder):
-        return {**told, "decodes": encoder.can_decode, "sha256": encoder.fingerprint}
+        return {**plain, "decodes": encoder.can_decode, "sha256": encoder.fingerprint}
     features = encoder.scaler.features(encoder.task)
     ranges = zip(features, encoder.scaler.low, encoder.scaler.high, strict=True)
     return {
-        **told,
+        **plain,
         "encoder": _layers(encoder.encoder),
         "decoder": _layers(encoder.decoder),
         **{name: getattr(encoder.header, name) for name in _RECORDS},
@@ -235,13 +235,13 @@ def _described(encoder: "BaseEncoder", source: str) -> dict[str, Any]:
 
 def card(encoder: "BaseEncoder", source: str, width: int) -> str:
     """The same in lines; of a file, also the range of each feature, scaled to [-1, 1]."""
-    told = _described(encoder, source)
-    features = told.pop("features", ())
+    plain = _described(encoder, source)
+    features = plain.pop("features", ())
     for part in ("encoder", "decoder"):
-        if part in told:
-            layers = (f"{layer['units']} {layer['activation']}" for layer in told[part])
-            told[part] = " -> ".join(layers) or "none"
-    named = {name: _said(value) for name, value in told.items() if value not in ({}, encoder.name)}
+        if part in plain:
+            layers = (f"{layer['units']} {layer['activation']}" for layer in plain[part])
+            plain[part] = " -> ".join(layers) or "none"
+    named = {name: _said(value) for name, value in plain.items() if value not in ({}, encoder.name)}
     text = f"{encoder.name}\n{facts(named, width)}"
     rows = [(f["name"], f["unit"], f"{f['low']:.4g}", f"{f['high']:.4g}") for f in features]
     return f"{text}\n\n{table(('feature', 'unit', 'low', 'high'), rows)}" if rows else text

@@ -147,7 +147,7 @@ def options_of(source: Any) -> dict[str, Option]:
     if isinstance(source, type):
         return {key.field: Option(key, is_of_record=True) for key in keys_of(source)}
     doc = inspect.getdoc(source) or ""
-    told = {name: " ".join(text.split()) for name, text in _ARGUMENT.findall(doc)}
+    help_of = {name: " ".join(text.split()) for name, text in _ARGUMENT.findall(doc)}
     own, others, made = dict[str, Option](), dict[str, Option](), dict[str, Option]()
     for each in inspect.signature(source).parameters.values():
         name, annotation, extra = each.name, each.annotation, _extra(each.annotation)
@@ -168,7 +168,7 @@ def options_of(source: Any) -> dict[str, Option]:
             continue
         words = [meta.description for meta in _metas(annotation) if meta.description]
         takes_all = each.kind is _Parameter.VAR_POSITIONAL
-        key = Key(name, name, annotation, default, told.get(name) or " ".join(words[-1:]), extra)
+        key = Key(name, name, annotation, default, help_of.get(name) or " ".join(words[-1:]), extra)
         is_argument = takes_all or each.kind is _Parameter.POSITIONAL_ONLY
         own[name] = Option(key, is_argument, takes_all=takes_all)
     for name, option in own.items():
@@ -340,9 +340,7 @@ def parse_pairs(given: Iterable[str], option: str = "--env") -> dict[str, Any]:
     for pair in given:
         name, equals, value = pair.partition("=")
         if not equals or not name.isidentifier() or name in arguments:
-            raise InputError(
-                f"{option} {pair} isn't an argument, or a second one: write NAME=VALUE"
-            )
+            raise InputError(f"{option} {pair} isn't an argument, or repeats one: write NAME=VALUE")
         try:
             arguments[name] = json.loads(value)
         except (ValueError, RecursionError):

@@ -41,7 +41,7 @@ def policies() -> None:
     say(table(header, rows, terminal_width()))
     episodes = len(ships[0].returns[SHIPPED])
     say(f"\nreturns: median [10 %, 90 %] of the same {episodes} episodes")
-    tell("falling: the preset wide, but with a learning rate that falls to 0")
+    tell("falling: the preset wide, with a learning rate that decays to 0")
 
 
 @command("policy export runs/a --out controller.onnx")
@@ -111,12 +111,12 @@ def evaluate_policy(
 
     POLICY is a folder of jbrep rl, a file that jbrep policy export wrote, a policy by its name,
     such as heuristic, or trained, which ships, or your own: mymodule:act, a function of an
-    observation, a class of such, or a model of stable-baselines3. A name is played on
+    observation, a class of such functions, or a stable-baselines3 model. A name is played on
     face_direction unless --task is given; your own needs it. A run that is under way or was stopped
     plays its last checkpoint. A policy by name may act on what an encoder's latent is decoded to:
     the return that it loses measures what the latent lacks.
 
-    With --perturb they are a table: how much of its return a policy keeps where sensors are noisy
+    --perturb prints a table: how much of its return a policy keeps where sensors are noisy
     or late, readings are lost, the body or the physics is another, or the robot is pushed.
 
     Args:
@@ -133,23 +133,24 @@ def evaluate_policy(
     from jbrep.envs.environments import EnvironmentFailedError
     from jbrep.envs.infos import Numbers
     from jbrep.play.perturbed import read_perturbation
+    from jbrep.play.sources import find_player
     from jbrep.records.storage import exists, taken
 
     chosen = [each for each in perturb if each]
     for each in chosen:
         read_perturbation(each)
     if out and not perturb:
-        raise InputError("--out is for the table of --perturb: add that")
+        raise InputError("--out needs --perturb, whose table it is for")
     if out and exists(out):
         raise taken(out)
-    player = _find(policy, encoder, options)
+    player, how = _find(policy, encoder, options), (threads, retries)
     source = None if encoder is None else source_of(encoder, player.task)
     if perturb:
-        _perturb(policy, player, chosen, (episodes, threads, retries), out, as_json)
+        _perturb(policy, player, chosen, episodes, how, out, as_json)
         return False
     returns, numbers, failure = list[float](), list[Numbers](), ""
     try:
-        for some in player.outcomes_in_turn(episodes, threads, retries):
+        for some in player.outcomes_in_turn(episodes, *how):
             returns += some.returns.tolist()
             numbers += some.numbers
     except EnvironmentFailedError as error:
@@ -158,7 +159,11 @@ def evaluate_policy(
         failure = str(error)
     _show_returns(policy, player, source, returns, numbers, as_json)
     if beside and not failure:
-        _compare(beside, player, returns, (episodes, threads, retries), err=as_json)
+        other = find_player(beside, player.task)
+        theirs = other.returns(episodes, *how)
+        largest = max(abs(a - b) for a, b in zip(returns, theirs.tolist(), strict=True))
+        said = f"{other.name}: {interval_of(theirs)}; returns differ by at most {largest:.3g}"
+        tell(said, err=as_json)
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
     return bool(failure)
@@ -192,49 +197,32 @@ def _show_returns(
         say(f"encoder: {source}")
     title, played = _title(policy, player), counted(len(returns), "episode")
     tell(f"{title}: median return {interval_of(returns)} (10-90 % of {played})")
-    if told := shares_text(by_name(numbers)):
-        tell(told)
+    if shares := shares_text(by_name(numbers)):
+        tell(shares)
     return None
-
-
-def _compare(
-    other: str,
-    player: "Player",
-    returns: list[float],
-    how: tuple[int, int | None, int],
-    err: bool,
-) -> None:
-    """Show what another policy returns in the same episodes."""
-    from jbrep.play.sources import find_player
-
-    beside = find_player(other, player.task)
-    theirs = beside.returns(*how)
-    apart = max(abs(own - its) for own, its in zip(returns, theirs.tolist(), strict=True))
-    told = f"{beside.name}: {interval_of(theirs)}; no episode's return differs by more than"
-    tell(f"{told} {apart:.3g}", err=err)
 
 
 def _perturb(
     policy: str,
     player: "Player",
     chosen: Sequence[str],
-    how: tuple[int, int | None, int],
+    episodes: int,
+    how: tuple[int | None, int],
     out: Path | None,
     as_json: bool,
 ) -> None:
     """Show how much of its return a policy keeps, and write that."""
-    from jbrep.play.perturbed import HEADER, Table, domains_of, perturb
+    from jbrep.play.perturbed import HEADER, PerturbationTable, domains_of, perturb
     from jbrep.records.storage import make_folder
 
     if out:
         make_folder(out.parent)
     domains, lacking = domains_of(player.task, chosen)
     if lacking and not chosen:
-        told = f"{player.task.name} has no {', '.join(lacking)} that could be changed"
-        tell(f"Note: {told}: left out", err=True)
+        tell(f"Note: left out, as {player.task.name} lacks it: {', '.join(lacking)}", err=True)
     with stoppable("no table was made"):
-        rows = tuple(perturb(player, domains, *how))
-    result = Table(
+        rows = tuple(perturb(player, domains, episodes, *how))
+    result = PerturbationTable(
         policy=policy,
         task=player.task.name,
         representation=player.representation,
@@ -245,7 +233,7 @@ def _perturb(
         result.write(out)
     if as_json:
         return say_json(to_plain(result))
-    tell(f"{_title(policy, player)}, each row the same {counted(how[0], 'episode')}")
+    tell(f"{_title(policy, player)}, each row the same {counted(episodes, 'episode')}")
     say(f"\n{table(HEADER, [row.cells for row in rows], terminal_width())}")
     return say(f"\n{out}") if out else None
 

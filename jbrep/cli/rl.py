@@ -21,7 +21,7 @@ def _rl(task: DrawnTask, out: Path, **options: Annotated[Any, api.train]) -> boo
         from jbrep.envs.make import is_one_robot
         from jbrep.rl.files import EVALUATIONS, RUN, last_infos, read_evaluations, read_infos
 
-        with _told_when_stopped(received, f"; {RESUMES}" if task.reproducible else ""):
+        with _reported_when_stopped(received, f"; {RESUMES}" if task.reproducible else ""):
             agent = api.train(task, out, stop=lambda: bool(received), **options)
     if agent.record.reason is not None:
         say(f"the run failed: {agent.record.reason}; see {out / RUN}", err=True)
@@ -29,8 +29,8 @@ def _rl(task: DrawnTask, out: Path, **options: Annotated[Any, api.train]) -> boo
         return True
     returns = agent.returns
     shown = f"final return on {agent.record.settings.representation}"
-    if told := shares_text(last_infos(read_infos(out), read_evaluations(out))):
-        tell(told)
+    if shares := shares_text(last_infos(read_infos(out), read_evaluations(out))):
+        tell(shares)
     with stoppable("the run itself is finished"):
         from jbrep.play.references import beside, mean_text  # which import scipy.stats
 
@@ -51,7 +51,7 @@ def _clone(out: Path, **options: Annotated[Any, api.clone]) -> None:
 
 
 @contextmanager
-def _told_when_stopped(received: list[int], more: str) -> Iterator[None]:
+def _reported_when_stopped(received: list[int], more: str) -> Iterator[None]:
     """End the command once a signal has stopped what it trains, as a shell reports it."""
     try:
         yield

@@ -49,7 +49,7 @@ def study(
     from jbrep.records.document import read_toml
 
     if dry_run and register:
-        raise InputError("--dry-run and --register exclude each other: choose one")
+        raise InputError("choose --dry-run or --register")
     if register and (workers or backend != "local"):
         raise InputError("--register runs nothing: leave out --workers and --backend")
     study = find_study(study)
@@ -85,7 +85,7 @@ def _announce(path: Path, folder: Path, dry_run: bool, workers: int | None) -> N
     found = registration_in(registered)
     say(f"registered on {found.date} (SHA-256 {found.sha256})")
     if plan.in_git:
-        tell(f"Commit {registered.name}, then run the study: before, it is refused.", err=True)
+        tell(f"Commit {registered.name} first: until then the study is refused.", err=True)
     return say(f"\n{registered}")
 
 

@@ -62,7 +62,7 @@ class _Making(Command):
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the command's options, the kinds, and the settings."""
 
-        def told(options: Iterable[click.Parameter]) -> list[tuple[str, str]]:
+        def records(options: Iterable[click.Parameter]) -> list[tuple[str, str]]:
             return [record for each in options if (record := each.get_help_record(ctx))]
 
         methods, settings = self._methods, self._settings
@@ -70,9 +70,9 @@ class _Making(Command):
             methods = {kind: methods[kind]}
             settings = self._settings_of(methods)
         sections = {
-            "Options": told(p for p in self.get_params(ctx) if p not in self._settings),
+            "Options": records(p for p in self.get_params(ctx) if p not in self._settings),
             "Kinds": [(kind, method.words()) for kind, method in methods.items()],
-            "Settings": told(settings),
+            "Settings": records(settings),
         }
         if len(self.kinds) == 1:
             del sections["Kinds"]
@@ -155,11 +155,11 @@ def train_dae(**options: Annotated[Any, api.train_encoders]) -> None:
 def train_encoder(kind: str, **options: Annotated[Any, api.train_encoders]) -> None:
     """Make encoders of any kind.
 
-    They learn from 80 % of the episodes, and say how good they are at what their kind is for. Each
+    They learn from 80 % of the episodes, and report how well they do what their kind is for. Each
     kind takes only some of the settings.
 
     Args:
-        kind: one of those below.
+        kind: a kind listed below.
     """
     given = _read(kind, options)
     with stoppable(f"{RESUMES}; the best so far is in {given['out']}"):

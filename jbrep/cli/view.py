@@ -92,11 +92,11 @@ def render(
     Args:
         out: a new file, .mp4 or .gif.
         episode: episode number, from 0.
-        camera: one that the robot's model has: of the Jitterbug overhead, tracking or egocentric.
+        camera: a camera of the robot's model; for the Jitterbug overhead, tracking or egocentric.
             If not given, one that follows the robot.
         size: size of each picture; default 640x480, in a GIF 320x240.
         fps: frames per second; default 25, in a GIF 12.5.
-        speed: 0.25 is slow motion.
+        speed: playback speed; 0.25 is slow motion.
         seconds: simulated seconds to show, from the start; all if not given.
     """
     from jbrep.opengl import find_opengl

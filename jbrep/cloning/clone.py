@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from msgspec import Meta
 
-from jbrep.cloning.objective import Cloning, Seen
+from jbrep.cloning.objective import Cloning, PolicyInputs
 from jbrep.cloning.td3_bc import TD3BC
 from jbrep.dataset import Dataset
 from jbrep.encoders import Encoder, save
@@ -22,7 +22,6 @@ from jbrep.envs.names import environment_versions, spec_of
 from jbrep.envs.recording import Outcome, joined, whole_outcome
 from jbrep.errors import InputError
 from jbrep.machine import cpu
-from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Finite, to_plain
@@ -97,8 +96,10 @@ class CloneRecord(Document, frozen=True, kw_only=True):
         kept = f"epoch {self.best_epoch} of {len(self.epochs)} is kept; held-out actions:"
         lines = [kept, Table("", ("", "error", "R²"), rows).text(width)]
         means = (("policy", self.policy), ("data", self.data))
-        told = "; ".join(f"{name} {mean}" for name, mean in means if mean)
-        return "\n".join(lines + ([wrapped(f"mean return [95 %]: {told}", width)] if told else []))
+        returns = "; ".join(f"{name} {mean}" for name, mean in means if mean)
+        return "\n".join(
+            lines + ([wrapped(f"mean return [95 %]: {returns}", width)] if returns else [])
+        )
 
 
 class Job(NamedTuple):
@@ -165,7 +166,7 @@ def learn(job: Job, folder: Path, threads: int | None = None) -> tuple[RunRecord
 
 def _learn(job: Job, folder: Path, threads: int | None) -> None:
     began, settings, how = time.monotonic(), job.settings, job.how
-    seen = Seen(job.data, job.encoder)
+    seen = PolicyInputs(job.data, job.encoder)
     if how.method != BC and not seen.reward_varies:
         raise InputError(
             f"{how.method} needs rewards that vary, and {job.data.folder} has none: jbrep data "
@@ -216,7 +217,9 @@ def _learn(job: Job, folder: Path, threads: int | None) -> None:
     (folder / _CHECKPOINT).unlink(missing_ok=True)
 
 
-def _train(job: Job, objective: Cloning, seen: Seen, checkpoint: Path) -> tuple[Trainer, Windows]:
+def _train(
+    job: Job, objective: Cloning, seen: PolicyInputs, checkpoint: Path
+) -> tuple[Trainer, Windows]:
     """Train to the end; the trainer, and held-out windows."""
     settings, device = job.settings, get_device(job.settings.device)
     objective.to(device)
@@ -230,14 +233,11 @@ def _train(job: Job, objective: Cloning, seen: Seen, checkpoint: Path) -> tuple[
     identity = {**to_plain(settings), "torch": packages()["torch"]}
     if exists(checkpoint):
         trainer.restore(identity, checkpoint)
-    saved, done = time.monotonic(), len(trainer.history)
-    with Progress(total=epochs, initial=done, desc=settings.learner, unit="epoch") as progress:
-        for epoch in trainer.epochs(job.how.patience if job.how.method == BC else None):
-            progress.set_postfix(train=f"{epoch.train_loss:.5f}", test=f"{epoch.test_loss:.5f}")
-            progress.update()
-            if time.monotonic() - saved > _SAVE_EVERY:
-                trainer.save(identity, checkpoint)
-                saved = time.monotonic()
+    saved, patience = time.monotonic(), job.how.patience if job.how.method == BC else None
+    for _ in trainer.with_progress(settings.learner, patience):
+        if time.monotonic() - saved > _SAVE_EVERY:
+            trainer.save(identity, checkpoint)
+            saved = time.monotonic()
     trainer.save(identity, checkpoint)
     return trainer, watched
 

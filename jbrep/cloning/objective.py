@@ -17,7 +17,7 @@ from jbrep.training.windows import Windows
 _NEGLIGIBLE = 1e-6  # standard deviation of a number that says nothing, of its magnitude
 
 
-class Seen(ScaledDataset):
+class PolicyInputs(ScaledDataset):
     """A data set's rows as a policy sees them: an encoder's latents, of mean 0 and variance 1.
 
     Attributes:

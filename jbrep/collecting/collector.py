@@ -10,7 +10,7 @@ import numpy as np
 from jbrep.collecting.backends import local
 from jbrep.collecting.policies import Policy, make_policy
 from jbrep.collecting.replay import replay_problems
-from jbrep.collecting.shards import NUM_ENVS, SHARD_ROWS, Growth, Produce, Simulator
+from jbrep.collecting.shards import NUM_ENVS, Growth, Produce, Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import (
     MANIFEST,
@@ -22,6 +22,7 @@ from jbrep.dataset.manifest import (
     write_manifest,
 )
 from jbrep.dataset.schema import EPISODES, DataSettings
+from jbrep.dataset.settings import MOST_SHARDS, SHARD_ROWS
 from jbrep.envs.environments import check_counts
 from jbrep.envs.make import is_batched
 from jbrep.errors import DamageError, InputError, differences
@@ -30,7 +31,6 @@ from jbrep.records.storage import check_space, exclusive, exists, make_folder, w
 from jbrep.text import counted
 
 _BATCH_ROWS = 100_000  # of a shard that a batch makes
-_MOST_SHARDS = 5_000  # of data that can't be made again, unless a shard has more than one episode
 _PILOT = 10  # episodes
 
 
@@ -182,7 +182,7 @@ def usual_shard_episodes(
     task = settings.task
     length = float(task.max_episode_steps)
     if not task.reproducible:
-        return max(1, round(settings.steps / length / _MOST_SHARDS))
+        return max(1, round(settings.steps / length / MOST_SHARDS))
     if task.terminates is not False:
         policy = policy or make_policy(settings.policy)
         simulator = Simulator(settings, policy, retries=retries)

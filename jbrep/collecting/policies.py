@@ -19,6 +19,7 @@ from jbrep.envs.recording import open_loop
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError, choose, refusing
 from jbrep.jitterbug.heuristics import HEURISTICS
+from jbrep.jitterbug.tasks import jitterbug_task
 from jbrep.records.record import Record, from_plain, to_plain
 
 _Drive = Annotated[float, Meta(ge=-1, le=1)]  # from the lower bound to the upper
@@ -144,12 +145,12 @@ class Heuristic(Constants, frozen=True):
     open_loop: ClassVar[bool] = False
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        if task.name not in HEURISTICS:
+        if (own := jitterbug_task(task)) is None:
             raise InputError(
                 f"{task.name} has no scripted policy: choose another policy than {self.kind}; "
-                f"those that have one are {', '.join(HEURISTICS)}"
+                f"those that have one are {', '.join(HEURISTICS)}, with nothing hidden"
             )
-        return HEURISTICS[task.name]
+        return HEURISTICS[own.name]
 
 
 def _one_by_one(blocks: Iterator[NDArray[Any]]) -> Actor:
@@ -187,8 +188,8 @@ class Mixture:
 
 
 @dataclass(frozen=True)
-class Own:
-    """A user's own: a function, a class of functions, or a model of stable-baselines3.
+class UserPolicy:
+    """A user's own policy: a function, a class of functions, or a stable-baselines3 model.
 
     A function takes an observation (d,) and gives an action (k,). A class has an instance for each
     episode, which begins with what it remembers. Where the attribute `batched` is true, one call
@@ -199,21 +200,21 @@ class Own:
 
     kind: ClassVar[str] = "own"
     name: str  # module:function and a digest of it
-    thing: Any = field(repr=False, compare=False)
+    policy: Any = field(repr=False, compare=False)
 
     @classmethod
-    def named(cls, code: str) -> "Own":
+    def named(cls, code: str) -> "UserPolicy":
         """What a name of code stands for, as in mymodule:act."""
         return cls(with_digest(code, "policy"), code_named(code, "policy"))
 
     @classmethod
-    def of(cls, thing: Any) -> "Own":
+    def of(cls, policy: Any) -> "UserPolicy":
         """A function, class or model itself."""
-        acting = getattr(thing, "policy", thing) if hasattr(thing, "predict") else thing
+        acting = getattr(policy, "policy", policy) if hasattr(policy, "predict") else policy
         if not (callable(acting) or hasattr(acting, "predict")):
             raise InputError(
                 f"the policy is {acting!r:.80}: it must be a name, a function of an observation, a "
-                "class of such, or a model of stable-baselines3"
+                "class of such functions, or a stable-baselines3 model"
             )
         kind = type(acting)
         name = f"{kind.__module__}:{kind.__qualname__}"
@@ -228,17 +229,17 @@ class Own:
         return {"kind": self.kind, "name": self.name}
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        batched = getattr(self.thing, "batched", False)
+        batched = getattr(self.policy, "batched", False)
         with self._refusing():
-            acting = [_acting(self.thing) for _ in range(1 if batched else len(seeds))]
+            actors = [_acting(self.policy) for _ in range(1 if batched else len(seeds))]
         low, high = np.array(task.action_low), np.array(task.action_high)
         shape = len(seeds), task.action_size
 
         def act(observation: Array) -> NDArray[Any]:
             seen = observation.astype(np.float32)
             with self._refusing():
-                rows = zip(acting, seen, strict=False)
-                made = acting[0](seen) if batched else [each(row) for each, row in rows]
+                rows = zip(actors, seen, strict=False)
+                made = actors[0](seen) if batched else [each(row) for each, row in rows]
                 actions = np.asarray(made, float)
             if actions.shape == shape[:1] and shape[1] == 1:
                 actions = actions[:, None]
@@ -249,7 +250,7 @@ class Own:
                     f"the policy {self.name} gives {what} of shape {given}: it must be {taken}, "
                     "all finite"
                 )
-            return np.minimum(np.maximum(actions, low), high)
+            return np.clip(actions, low, high)
 
         return act
 
@@ -257,9 +258,9 @@ class Own:
         return refusing(f"the policy {self.name} fails")
 
 
-def _acting(thing: Any) -> Callable[[NDArray[np.float32]], Any]:
+def _acting(policy: Any) -> Callable[[NDArray[np.float32]], Any]:
     """The function that acts in an episode that begins now."""
-    made = thing() if isinstance(thing, type) else thing
+    made = policy() if isinstance(policy, type) else policy
     if not hasattr(made, "predict"):
         return made
     state, first = None, True
@@ -289,7 +290,7 @@ def parse_policy(text: str, other: Callable[[str], Policy | None] = lambda text:
     if not _WEIGHT.search(text):
         kind, _, constants = text.partition(":")
         if kind not in POLICIES and is_code(text):
-            return Own.named(text)
+            return UserPolicy.named(text)
         if kind not in POLICIES:
             raise InputError(
                 f"unknown policy {kind!r}: choose one of {', '.join(POLICIES)}, trained, the "

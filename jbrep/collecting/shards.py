@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from jbrep.collecting.policies import Policy
 from jbrep.dataset.manifest import Manifest, commit, open_shard
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined, some_episodes
+from jbrep.dataset.settings import SHARD_ROWS
 from jbrep.envs.environments import EnvironmentFailedError, Environments, Retries
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Recording, Tick, read_nothing, read_states, record
 from jbrep.errors import InputError
 
 NUM_ENVS = 100  # of a batch
-SHARD_ROWS = 20_000  # of a shard of the usual size, unless a batch makes it
 
 Array = NDArray[Any]
 

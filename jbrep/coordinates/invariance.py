@@ -10,7 +10,7 @@ from gymnasium.spaces.utils import flatten
 
 from jbrep.coordinates.coordinates import Coordinates
 from jbrep.coordinates.made import Ingredient, System, make_coordinates
-from jbrep.envs.aside import aside
+from jbrep.envs.isolation import isolated
 from jbrep.envs.make import action_in, make_env
 from jbrep.envs.names import spec_of
 from jbrep.envs.physics import quarter_turn
@@ -46,7 +46,7 @@ def check_invariant(coordinates: Coordinates) -> None:
     end alike, too. Where all rewards were the same, a notice says that they tell nothing.
     """
     task = coordinates.task
-    with refusing(f"symmetry can't be tried on {task.name}"), aside():
+    with refusing(f"symmetry can't be tried on {task.name}"), isolated():
         steps = _tried(task)
     if not steps:
         raise InputError(

@@ -49,8 +49,8 @@ def make_coordinates(
         )
     if made.names == task.feature_names:
         raise InputError(
-            f"{task.name} has no features of which {system} would be anything else than the "
-            "observation: say of what kinds they are, with `features` FILE.toml"
+            f"{system} of {task.name} would be the observation: declare kinds of its features, "
+            "with `features` FILE.toml"
         )
     return made
 

@@ -28,7 +28,7 @@ class Layout(Record, frozen=True, kw_only=True):
     actions: Annotated[
         _Names,
         Meta(
-            description="Those of the action, likewise.",
+            description="Columns that make the action, likewise.",
             extra={"default": "action, or action_0, action_1 and so on"},
         ),
     ] = ()
@@ -41,7 +41,8 @@ class Layout(Record, frozen=True, kw_only=True):
         ),
     ] = ""
     time: Annotated[
-        str, Meta(description="The column of times: dates, or s, or as its unit or --units says.")
+        str,
+        Meta(description="The column of times: dates, or numbers, in s unless a unit is given."),
     ] = ""
     episode: Annotated[
         str, Meta(description="A column that changes where an episode ends: numbers or words.")
@@ -55,21 +56,22 @@ class Layout(Record, frozen=True, kw_only=True):
     ] = ""
     units: Annotated[
         Mapping[_Name, str],
-        Meta(description="Of columns: pitch=deg,t=ms.", extra={"default": "as in 'pitch [deg]'"}),
+        Meta(
+            description="Units of columns: pitch=deg,t=ms.",
+            extra={"default": "as in 'pitch [deg]'"},
+        ),
     ] = {}
     angles: Annotated[
         _Names, Meta(description="Observations that are angles, in rad or deg, which may wrap.")
     ] = ()
-    gap: Annotated[
-        _Seconds | None, Meta(description="An episode ends where nothing comes for so long [s].")
-    ] = None
+    gap: Annotated[_Seconds | None, Meta(description="A pause that ends an episode [s].")] = None
     length: Annotated[
         Annotated[int, Meta(ge=2, le=1_000_000)] | None,
-        Meta(description="An episode is cut after so many rows."),
+        Meta(description="Rows after which an episode is cut."),
     ] = None
     rate: Annotated[
         Annotated[float, Meta(gt=0, le=1e6)] | None,
-        Meta(description="Bring the rows to an even clock of so many a second [Hz]."),
+        Meta(description="Resample the rows to this rate [Hz]."),
     ] = None
     fill: Annotated[
         Literal["latest", "linear"],

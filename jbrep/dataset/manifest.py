@@ -237,8 +237,8 @@ def find_problems(folder: Path) -> Iterator[str]:
             yield str(damage)
             continue
         if not manifest.settings.is_imported:  # which tells of its own
-            told = range_problems(manifest.settings.task, columns)
-            yield from (f"{shard_path(folder, shard)}: {each}" for each in told)
+            problems = range_problems(manifest.settings.task, columns)
+            yield from (f"{shard_path(folder, shard)}: {each}" for each in problems)
 
 
 def policy_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:

@@ -268,8 +268,8 @@ class Dataset:
             named["reward"] = f"by {code}"
         if note := about.get("note"):
             named["note"] = note
-        told = f"{self.folder}\n{facts(named, width)}"
-        return f"{told}\n\n{Table('', _RANGES, rows).text(width)}" if rows else told
+        text = f"{self.folder}\n{facts(named, width)}"
+        return f"{text}\n\n{Table('', _RANGES, rows).text(width)}" if rows else text
 
 
 def _spread_text(values: Mapping[str, float]) -> str:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import itemgetter
 from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
@@ -60,10 +61,10 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
     reward: _Code | UnsetType = UNSET  # what has given the rewards, if not the environment
 
     def check(self) -> None:
-        told = {TRAINED: ("file", "sha256", "run", "step")}
-        with refusing("a policy lacks what is said of each", (LookupError, TypeError, ValueError)):
-            for each in parts_of(self.policy):
-                _ = [each[key] for key in told.get(each["kind"], ())]
+        with refusing("the policy lacks a setting", (LookupError, TypeError, ValueError)):
+            for policy in parts_of(self.policy):
+                if policy["kind"] == TRAINED:
+                    itemgetter("file", "sha256", "run", "step")(policy)
         self.specs()
         episode_seed(self.task, self.seed, (self.steps - 1) // self.task.max_episode_steps)
         if self.store_state and not self.task.state:

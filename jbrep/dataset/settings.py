@@ -1,6 +1,6 @@
 """What a user chooses of a data set besides its task: how much of it, and the policy that acts."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from msgspec import Meta
@@ -10,6 +10,8 @@ from jbrep.records.record import Record
 IMPORTED = "imported"  # data that were made elsewhere
 MIXTURE = "mixture"  # a policy for each episode, by weights
 TRAINED = "trained"  # of a run, kept in a file beside the shards
+SHARD_ROWS = 20_000  # of a usual shard
+MOST_SHARDS = 5_000  # of data that can't be collected again
 MAX_LETTERS = 200  # of a text
 MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 
@@ -26,10 +28,7 @@ ShardEpisodes = Annotated[
         ge=1,
         le=1_000_000,
         description="Episodes in a shard.",
-        extra={
-            "default": "so many that a shard has 100,000 steps in a batch of the Jitterbug, "
-            "20,000 in others"
-        },
+        extra={"default": "enough for 20,000 steps, or 100,000 in a batch of the Jitterbug"},
     ),
 ]
 StoreState = Annotated[bool, Meta(description="Store the Jitterbug's qpos and qvel, too.")]
@@ -44,9 +43,9 @@ class CollectSettings(Record, frozen=True, kw_only=True):
     store_state: StoreState = False
 
 
-def parts_of(policy: PolicySettings) -> Iterator[PolicySettings]:
+def parts_of(policy: PolicySettings) -> list[PolicySettings]:
     """The policies of a mixture, or else the policy itself."""
-    yield from (part for _, part in policy["parts"]) if policy["kind"] == MIXTURE else (policy,)
+    return [part for _, part in policy["parts"]] if policy["kind"] == MIXTURE else [policy]
 
 
 def policy_text(policy: PolicySettings) -> str:

@@ -148,7 +148,7 @@ class OwnEncoder(BaseEncoder):
 
     def check_task(self, task: Task) -> None:
         if check := getattr(self.given, "check_task", None):
-            with refusing(f"{self.name} refuses {task.name}", told=_reason):
+            with refusing(f"{self.name} refuses {task.name}", describe=_reason):
                 check(task)
         elif task.size != self.size:
             raise InputError(

@@ -36,7 +36,7 @@ class Model:
     activation = ONNX
 
     def __init__(self, content: bytes):
-        with refusing("it isn't an ONNX model", told=first_line):
+        with refusing("it isn't an ONNX model", describe=first_line):
             self.proto = onnx.load_model_from_string(content)
             self._content = content
             for each in _messages(self.proto):
@@ -56,7 +56,7 @@ class Model:
         if not isinstance(values, np.ndarray):  # rows of a model that it becomes part of
             return values.through(self.proto, self.units)
         rows = values.reshape(-1, self.inputs).astype(self._dtype)
-        with refusing("the ONNX model failed", told=first_line):
+        with refusing("the ONNX model failed", describe=first_line):
             (made,) = self._session.run(None, {self.proto.graph.input[0].name: rows})
         if made.shape != (len(rows), self.units):
             raise InputError(f"the ONNX model made shape {made.shape} of {len(rows)} rows")
@@ -108,7 +108,7 @@ def _read(path: Path) -> tuple[ModelProto, ModelProto | None]:
     """A model; of one with a latent and a reconstruction the ways to and from the latent."""
     if not exists(path):
         raise InputError(f"no file {path}")
-    with refusing(f"{path} isn't an ONNX model that can be read", told=first_line):
+    with refusing(f"{path} isn't an ONNX model that can be read", describe=first_line):
         model = onnx.load(path)  # with numbers in files beside it
         onnx.checker.check_model(model)
     outputs = [each.name for each in model.graph.output]
@@ -144,7 +144,7 @@ def _layer(said: str, model: ModelProto, size: int) -> Model:
     made.ClearField("shape")
     rows = np.zeros((2, size), helper.tensor_dtype_to_np_dtype(given.elem_type))
     what = f"{said} can't be run on several rows: export it with a dynamic first dimension"
-    with refusing(what, told=first_line):
+    with refusing(what, describe=first_line):
         (result,) = session(model.SerializeToString()).run(None, {inputs[0].name: rows})
     if result.ndim != 2 or result.dtype.kind != "f":
         raise InputError(

@@ -115,7 +115,7 @@ class JitterbugVecEnv(VecEnv):
                 infos[index] = {
                     "terminal_observation": final,
                     "TimeLimit.truncated": not moved.terminated[index],
-                    **moved.told(index),
+                    **moved.end_info(index),
                 }
         reward = moved.reward.astype(np.float32)
         return self._represent(moved.observation), reward, moved.ended, infos

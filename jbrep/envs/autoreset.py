@@ -22,12 +22,12 @@ class AutoresetStep(NamedTuple):
     terminated: Flags  # (n,) whether a state ended it
     non_finite: Flags | None  # (n,) whether the physics diverged, where the environment says so
 
-    def told(self, index: int) -> dict[str, Any]:
+    def end_info(self, index: int) -> dict[str, Any]:
         """What there is to say of the end of an episode, some of it by its environment."""
-        told: dict[str, Any] = {"control_steps": int(self.length[index])}
+        info: dict[str, Any] = {"control_steps": int(self.length[index])}
         if self.non_finite is not None:
-            told["non_finite"] = bool(self.non_finite[index])
-        return told
+            info["non_finite"] = bool(self.non_finite[index])
+        return info
 
 
 class AutoresetEnvironments:
@@ -39,7 +39,8 @@ class AutoresetEnvironments:
 
     Args:
         repeat: steps for which each action is held; fewer where an episode ends before.
-        retries: of failures, each of which ends an episode, truncated, before the step that failed.
+        retries: of failures, each of which ends an episode, truncated. The step that failed leads
+            to where it began, with the reward of the step before.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class AutoresetEnvironments:
         self._episodes = np.zeros(num_envs, np.int64)  # k of each environment's episode
         self._taken: list[Array] = []  # actions since the oldest episode of now began, (n, k) each
         self._begun = np.zeros(num_envs, np.int64)  # how many of them came before each episode
+        self._reward = np.zeros(num_envs)  # of the last step
 
     def reset(self, seeds: Sequence[int | None]) -> Array:
         """Start the first episode of each new seed, or the next one; observations (n, d)."""
@@ -89,7 +91,8 @@ class AutoresetEnvironments:
         for _ in range(self._repeat):
             active = envs.active
             step = envs.step(actions)
-            total += step.reward
+            self._reward = np.where(envs.lost, self._reward, step.reward)
+            total += self._reward
             if (now := envs.info.get("non_finite")) is not None:
                 diverged = now if diverged is None else np.where(active, now, diverged)
             if not envs.num_active:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from msgspec.structs import asdict
 
-from jbrep.envs.aside import aside
 from jbrep.envs.domain import PHYSICS, SIGNALS, Domain, read_ranges
 from jbrep.envs.environments import Environments
+from jbrep.envs.isolation import isolated
 from jbrep.envs.make import creator, give_back, is_batched, take
 from jbrep.envs.names import absolute, code_of, files_of, find_spec, spec_of, taken_for
 from jbrep.envs.physics import can_be_pushed, physics_of
@@ -106,7 +106,7 @@ def _describe(
     spec, given = find_spec(name), json.loads(arguments)
     if max_episode_steps is not None:
         converted(max_episode_steps, EpisodeSteps, "the number of steps in an episode")
-    with refusing(f"{spec.id} failed when it was tried"), aside():
+    with refusing(f"{spec.id} failed when it was tried"), isolated():
         own = getattr(creator(spec), "describe", None)
         if own is None:
             return probe(spec.id, given, max_episode_steps, bounds)
@@ -163,8 +163,8 @@ def with_features(task: Task, said: Path | str | Mapping[str, Any]) -> Task:
             features[i] = features[i].replace(**left | own)
             if offset:
                 offsets[features[i].name] = offset
-        told = {**_said(changes), "features": features}
-        return task.replace(**told, **({"offsets": offsets} if offsets else {}))
+        declared = {**_said(changes), "features": features}
+        return task.replace(**declared, **({"offsets": offsets} if offsets else {}))
     except InputError as error:
         where = "features" if isinstance(said, Mapping) else said
         raise InputError(f"{where} can't be used for {task.name}: {error}") from None

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.envs.aside import OURS, aside, in_time
 from jbrep.envs.disturbed import Disturbed
 from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
+from jbrep.envs.isolation import OURS, in_time, isolated
 from jbrep.envs.make import (
     action_in,
     discard,
@@ -26,7 +26,7 @@ from jbrep.envs.make import (
     take,
 )
 from jbrep.envs.task import Array, Task, most_held
-from jbrep.envs.view import Seen
+from jbrep.envs.view import ViewedBatch
 from jbrep.errors import STEP_TIMEOUT, InputError, Notice, kind_and_line
 
 Flags = NDArray[np.bool_]
@@ -145,7 +145,7 @@ class Environments:
         if task.domain:
             self._batch = Disturbed(self._batch, task, num_envs)
         if task.view:
-            self._batch = Seen(self._batch, task, num_envs)
+            self._batch = ViewedBatch(self._batch, task, num_envs)
         self.lost = np.zeros(num_envs, np.bool_)
         self.missing: NDArray[np.int64] = getattr(
             self._batch, "missing", np.zeros(num_envs, np.int64)
@@ -320,7 +320,7 @@ class Separate:
             self.failed[index] = False
             try:
                 self.instances[index] = self.instances[index] or self._take()
-                with aside(), in_time():
+                with isolated(), in_time():
                     observation, info = self.instances[index].reset(seed=seed)
                 return self._put(index, observation, info)
             except OURS:
@@ -335,7 +335,7 @@ class Separate:
         single = actions.astype(np.float32)
         terminated, truncated = np.zeros((2, len(chosen)), np.bool_)
         timed = in_time if STEP_TIMEOUT in os.environ else nullcontext  # which costs less
-        with aside(in_episode=True):
+        with isolated(in_episode=True):
             for index in np.flatnonzero(chosen).tolist():
                 self._steps[index] += 1
                 try:
@@ -435,7 +435,7 @@ class Separate:
         self._retries[index].failed(error)
 
     def render(self) -> tuple[Any, ...]:
-        with aside():
+        with isolated():
             return tuple(env.render() for env in self.instances)
 
     @property
@@ -444,8 +444,8 @@ class Separate:
 
         An environment may go on after a success, so its last step alone would miss some.
         """
-        told = zip(self._infos, self._succeeded.tolist(), strict=True)
-        return [numbers_in(info) | ({SUCCESS: 1.0} if won else {}) for info, won in told]
+        pairs = zip(self._infos, self._succeeded.tolist(), strict=True)
+        return [numbers_in(info) | ({SUCCESS: 1.0} if won else {}) for info, won in pairs]
 
     def close(self) -> None:
         """Give the environments back."""

@@ -27,8 +27,8 @@ def number_of(value: Any) -> float | None:
 
 def numbers_in(info: Mapping[str, Any]) -> Numbers:
     """The numbers in an environment's `info`, in its order; those with printable names."""
-    told = ((name, number_of(value)) for name, value in info.items() if _is_name(name))
-    return {name: value for name, value in told if value is not None}
+    pairs = ((name, number_of(value)) for name, value in info.items() if _is_name(name))
+    return {name: value for name, value in pairs if value is not None}
 
 
 def by_name(episodes: Iterable[Mapping[str, float]]) -> dict[str, list[float]]:

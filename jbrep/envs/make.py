@@ -21,9 +21,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
-from jbrep.envs.aside import aside
 from jbrep.envs.disturbed import Varied
 from jbrep.envs.domain import Domain
+from jbrep.envs.isolation import isolated
 from jbrep.envs.names import INSTANCE, files_of, find_spec, spec_of
 from jbrep.envs.task import Task
 from jbrep.errors import Notice, kind_and_line, refusing
@@ -63,7 +63,7 @@ def make_batch(task: Task, num_envs: int, num_threads: int | None) -> VectorEnv[
 @contextmanager
 def _making(env_id: str, arguments: Mapping[str, Any]) -> Iterator[None]:
     given = f" with {dict(arguments)}" if arguments else ""
-    with refusing(f"can't make {env_id}{given}"), _quiet(), aside():
+    with refusing(f"can't make {env_id}{given}"), _quiet(), isolated():
         yield
 
 
@@ -213,7 +213,7 @@ def close_all() -> None:
 
 def _close(env: Env) -> None:
     try:
-        with aside():
+        with isolated():
             env.close()
     except Exception as error:
         warnings.warn(f"an environment can't be closed: {kind_and_line(error)}", Notice, 2)

@@ -64,10 +64,10 @@ def spec_of(task: Task) -> EnvSpec:
     try:
         return find_spec(task.id)
     except InputError as error:
-        for module in modules_of(task):
+        if modules := modules_of(task):
             raise InputError(
-                f"unknown task {task.id!r}: {module} defines it; `import` {shlex.quote(module)}, "
-                "or the module that registers it: this runs its code"
+                f"unknown task {task.id!r}: {modules[0]} defines it; `import` "
+                f"{shlex.quote(modules[0])}, or the module that registers it: this runs its code"
             ) from None
         raise InputError(f"{error}. What comes of a log alone has no environment") from None
 

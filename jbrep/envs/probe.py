@@ -12,8 +12,8 @@ from gymnasium.spaces.utils import flatdim, flatten_space
 from gymnasium.wrappers import TransformAction
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.envs.aside import in_time
 from jbrep.envs.infos import number_of
+from jbrep.envs.isolation import in_time
 from jbrep.envs.make import Env, action_in, discard, flattener, give_back, number, of_size, take
 from jbrep.envs.names import find_spec
 from jbrep.envs.physics import physics_of, planar_root, robot_joint
@@ -116,7 +116,7 @@ def _play(env: Env, seed: int, most: int, still: bool = False) -> Iterator[_Step
 
 
 def _content(steps: Sequence[_Step]) -> list[bytes]:
-    return [flat.tobytes() + np.array(told).tobytes() for flat, *told in steps]
+    return [flat.tobytes() + np.array(others).tobytes() for flat, *others in steps]
 
 
 def _find_limit(env: Env, env_id: str) -> int:

@@ -20,7 +20,7 @@ Read = Callable[
 ]  # of the environments as they are, (n, ...) each
 
 
-class Played(NamedTuple):
+class PlayedStep(NamedTuple):
     """A step of n environments, and what came before it."""
 
     observation: Array  # before it, (n, d)
@@ -29,12 +29,12 @@ class Played(NamedTuple):
     step: Step
 
 
-def play(envs: Environments, act: Actor) -> Iterator[Played]:
+def play(envs: Environments, act: Actor) -> Iterator[PlayedStep]:
     """Step until every episode has ended; while a step is yielded, they are where it led."""
     while envs.num_active:
         observation, active = envs.observation, envs.active
         action = act(observation)
-        yield Played(observation, action, active, envs.step(action))
+        yield PlayedStep(observation, action, active, envs.step(action))
 
 
 def held(

@@ -72,7 +72,7 @@ class Window:
         return np.hstack((self._states.reshape(n, -1), self._actions.reshape(n, -1)))
 
 
-class Seen:
+class ViewedBatch:
     """A batch of environments, as `Environments` steps one, of which a task's view is seen."""
 
     def __init__(self, batch: Any, task: Task, num_envs: int):

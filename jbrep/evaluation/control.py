@@ -13,7 +13,6 @@ from scipy.signal import lfilter
 from jbrep.coordinates import make_coordinates
 from jbrep.dataset.scaled import sample
 from jbrep.encoders.base import BaseEncoder
-from jbrep.envs.task import Feature
 from jbrep.errors import InputError
 from jbrep.evaluation.evaluation import (
     Judged,
@@ -108,12 +107,12 @@ def problems(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dic
     No values where too few episodes are left to fit to and to judge on.
     """
     seen, taken, _ = held_out.once(_acting, policy, "train")
-    told = {"action": Problem(encoder.encode(seen), taken)}
+    found = {"action": Problem(encoder.encode(seen), taken)}
     if states := policy.states:
         latent = encoder.encode(states.observation)
         for name, judged in states.folds.items():
-            told[name] = Problem(latent[~judged], states.value[~judged], share=_SHARE)
-    return told
+            found[name] = Problem(latent[~judged], states.value[~judged], share=_SHARE)
+    return found
 
 
 @diagnostic(Scalar("value", "R² of a good policy's return to go", is_first=True))
@@ -179,27 +178,28 @@ def needs(
         return Needs(None, {})
     count = max(2, _NUMBERS // held_out.data.task.size)  # rows in which features are shuffled
     steps = held_out.once(following, "test", ahead)
-    some, told = sample(np.arange(len(steps.rows)), count), learnt.forward[ahead]
-    seen, inputs = steps.observation[some], steps.action[some]
-    shares = _shares(
-        lambda seen: told(np.hstack((full.encode(seen), inputs))), seen, steps.wanted[some]
+    rows, network = sample(np.arange(len(steps.rows)), count), learnt.forward[ahead]
+    observation, actions, wanted = (
+        e[rows] for e in (steps.observation, steps.action, steps.wanted)
     )
+
+    def predict(values: NDArray[Any]) -> Array:
+        return network(np.hstack((full.encode(values), actions)))
+
+    shares = _shares(predict, observation, wanted)
     moving, reward = shares[:, :-1], shares[:, -1]
-    of_policy = _of_policy(full, policy, learnt, seen) if policy else []
+    of_policy = _of_policy(full, policy, learnt, observation) if policy else []
     direct = np.max([reward, *of_policy], axis=0)
-    world = np.array([_is_of_the_world(each) for each in held_out.data.task.features])
+    features = held_out.data.task.features
+    world = np.array([f.kind == "point" or (f.is_angle and f.frame == "world") for f in features])
     if 2 * reward[world].sum() > reward.sum():
-        error = np.square(told(np.hstack((full.encode(seen), inputs))) - steps.wanted[some])
+        error = np.square(predict(observation) - wanted)
         most = error[:, -1].mean() + _SPARE * steps.wanted[:, -1].var()
-        if _error_without_the_world(held_out, ahead, some) < most:
+        if _error_without_the_world(held_out, ahead, rows) < most:
             reward, direct = np.where(world, 0, reward), np.where(world, 0, direct)
     need = np.maximum(direct, (moving * direct).max(axis=1)).tolist()
     names = held_out.data.task.feature_names
     return Needs(reward if reward.any() else None, dict(zip(names, need, strict=True)))
-
-
-def _is_of_the_world(feature: Feature) -> bool:
-    return feature.kind == "point" or (feature.is_angle and feature.frame == "world")
 
 
 def _error_without_the_world(held_out: HeldOut, ahead: int, some: Rows) -> float:

@@ -94,12 +94,12 @@ def problems(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, tuple[Problem
 
     The reward has a network of its own: beside many features a rare one would hardly be learnt.
     """
-    told = {}
+    problems = {}
     for ahead in usual_horizons(held_out.data):
         steps = held_out.once(following, "train", ahead)
         inputs, (changed, reward) = steps.inputs(encoder), np.split(steps.wanted, [-1], axis=1)
-        told[ahead] = Problem(inputs, changed, share=_SHARE), Problem(inputs, reward)
-    return told
+        problems[ahead] = Problem(inputs, changed, share=_SHARE), Problem(inputs, reward)
+    return problems
 
 
 def usual_horizons(data: ScaledDataset) -> list[int]:

@@ -56,13 +56,11 @@ def every(task: Task, observation: ArrayLike) -> Columns:
     """All features, (n, k) by name: angles as cosine and sine."""
     columns = np.asarray(observation, np.float64).T
     return {
-        feature.name: _on_circle(column) if feature.is_full_turn else column[:, None]
+        feature.name: np.column_stack(
+            (np.cos(column), np.sin(column)) if feature.is_full_turn else (column,)
+        )
         for feature, column in zip(task.features, columns, strict=True)
     }
-
-
-def _on_circle(angle: Array) -> Array:
-    return np.stack((np.cos(angle), np.sin(angle)), axis=1)
 
 
 def probe_problem(encoder: BaseEncoder, held_out: HeldOut) -> Problem:

@@ -83,42 +83,42 @@ class _Standard:
 
 
 def _fit(problems: Sequence[Problem], steps: int) -> list[Predictor]:
-    """Fit networks in so many steps; narrower ones are filled up with zeros, which stay zeros."""
-    enter = [_Standard(problem.values) for problem in problems]
-    leave = [_Standard(problem.wanted) for problem in problems]
-    inputs, outputs = (max(len(each.mean) for each in several) for several in (enter, leave))
+    """Fit networks for that many steps; narrower ones are padded with zeros, which stay zeros."""
+    input_scalers = [_Standard(problem.values) for problem in problems]
+    target_scalers = [_Standard(problem.wanted) for problem in problems]
+    inputs, outputs = (max(len(s.mean) for s in each) for each in (input_scalers, target_scalers))
 
-    def seen(i: int, values: NDArray[Any]) -> Tensor:
-        limited = enter[i](values).clamp_(-_LIMIT, _LIMIT)
+    def scaled_inputs(i: int, values: NDArray[Any]) -> Tensor:
+        limited = input_scalers[i](values).clamp_(-_LIMIT, _LIMIT)
         return pad(limited, (0, inputs - limited.shape[1]))
 
     def predictor(i: int, network: list[Tensor]) -> Predictor:
         def predict(values: NDArray[Any]) -> Array:
             with single_torch_thread(), torch.inference_mode():
-                blocks = [_apply(network, block) for block in seen(i, values).split(_BLOCK)]
-                given = torch.cat(blocks)[:, : len(leave[i].mean)].numpy()
-            return given * leave[i].deviation + leave[i].mean
+                blocks = [_apply(network, each) for each in scaled_inputs(i, values).split(_BLOCK)]
+                scaled = torch.cat(blocks)[:, : len(target_scalers[i].mean)].numpy()
+            return scaled * target_scalers[i].deviation + target_scalers[i].mean
 
         return predict
 
-    begun, drawn = list[list[Tensor]](), list[Tensor]()
-    rows, true = list[Tensor](), list[Tensor]()
+    initial, drawn = list[list[Tensor]](), list[Tensor]()
+    inputs_of, targets_of = list[Tensor](), list[Tensor]()
     for i, problem in enumerate(problems):  # each as if it were alone
-        random, first = torch.Generator().manual_seed(0), sum(len(each) for each in rows)
-        begun.append(_begin(len(enter[i].mean), len(leave[i].mean), inputs, outputs, random))
+        random, first = torch.Generator().manual_seed(0), sum(map(len, inputs_of))
+        target = target_scalers[i](problem.wanted)
+        initial.append(_begin(problem.values.shape[1], target.shape[1], inputs, outputs, random))
         numbers = torch.rand(steps, _BATCH, generator=random, dtype=torch.float64)
         drawn.append((numbers * len(problem.values)).long() + first)
-        rows.append(seen(i, problem.values))
-        wanted = leave[i](problem.wanted)
-        true.append(pad(wanted, (0, outputs - wanted.shape[1])))
-    network = [torch.stack(parts).requires_grad_() for parts in zip(*begun, strict=True)]
-    widths = torch.tensor([len(each.mean) for each in leave])[:, None, None]
-    every, targets = torch.cat(rows), torch.cat(true)
+        inputs_of.append(scaled_inputs(i, problem.values))
+        targets_of.append(pad(target, (0, outputs - target.shape[1])))
+    network = [torch.stack(parts).requires_grad_() for parts in zip(*initial, strict=True)]
+    widths = torch.tensor([len(each.mean) for each in target_scalers])[:, None, None]
+    all_inputs, all_targets = torch.cat(inputs_of), torch.cat(targets_of)
     adam = torch.optim.Adam(network, lr=_LEARNING_RATE, fused=True)
-    for step, some in enumerate(torch.stack(drawn, 1)):
-        rising, falling = (step + 1) / (_RISING * steps), (1 + math.cos(math.pi * step / steps)) / 2
-        adam.param_groups[0]["lr"] = _LEARNING_RATE * min(rising, 1) * falling
-        error = _apply(network, every[some]) - targets[some]
+    for step, batch in enumerate(torch.stack(drawn, 1)):
+        warm_up, decay = (step + 1) / (_RISING * steps), (1 + math.cos(math.pi * step / steps)) / 2
+        adam.param_groups[0]["lr"] = _LEARNING_RATE * min(warm_up, 1) * decay
+        error = _apply(network, all_inputs[batch]) - all_targets[batch]
         adam.zero_grad()
         ((error.square() / widths).sum() / _BATCH).backward()
         adam.step()

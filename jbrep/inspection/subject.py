@@ -202,8 +202,10 @@ def record_traversal(rollout: Rollout, path: Path, encoder: BaseEncoder) -> None
         recording.send_series(f"{below}/most", times, scaled[:, most], [titles[i] for i in most])
         ends = f"{latent[0, unit]:.2f} | {latent[-1, unit]:.2f}"
         spans = [(task.features[i], np.ptp(smooth[:, i])) for i in most]
-        told = ", ".join(f"{f.name} {span:.3g} {f.unit}".removesuffix(" 1") for f, span in spans)
-        summary.append(f"| {unit} | {ends} | {told} |")
+        spans_text = ", ".join(
+            f"{f.name} {span:.3g} {f.unit}".removesuffix(" 1") for f, span in spans
+        )
+        summary.append(f"| {unit} | {ends} | {spans_text} |")
     recording.send_text(f"{TRAVERSE}/summary", "\n".join(summary))
     recording.write(path, traversal_layout(len(swept), robot, places))
 

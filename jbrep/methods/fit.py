@@ -1,6 +1,5 @@
 """Making encoders by every method from a data set, each in its file."""
 
-from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,17 +17,16 @@ from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import Encoder, load, save
 from jbrep.encoders.encoder import SUFFIX
 from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader, check_name
-from jbrep.encoders.layers import Layer, dense, run
+from jbrep.encoders.layers import dense, run
 from jbrep.envs.task import Array
 from jbrep.errors import InputError, differences
 from jbrep.methods.linear import DEVIATION, held_out_error, inverse_root
 from jbrep.methods.registry import get_method, name_of
-from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.storage import exclusive, exists, make_folder
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method
 from jbrep.training.objective import Layers
-from jbrep.training.trainer import Epoch, Trainer, default_batch_size, get_device, single_thread
+from jbrep.training.trainer import Trainer, default_batch_size, get_device, single_thread
 from jbrep.training.windows import Windows, count_windows, watched_windows
 
 _NEGLIGIBLE = 1e-12  # variance of a unit that says nothing
@@ -50,7 +48,7 @@ class Fitted(NamedTuple):
         )
 
 
-class Plan(NamedTuple):
+class FitPlan(NamedTuple):
     """An encoder that can be made: its settings have been checked."""
 
     method: Method
@@ -104,7 +102,7 @@ class Fitter:
             is_new = not plan.is_complete() and self._make_once(plan)
         return Fitted(load(plan.path), plan.path, is_new)
 
-    def plan(self, kind: str, *, name: str | None = None, **settings: Any) -> Plan:
+    def plan(self, kind: str, *, name: str | None = None, **settings: Any) -> FitPlan:
         """What `fit` would make."""
         method = get_method(kind).of(settings)
         data = self._scaled_data(method)
@@ -116,7 +114,7 @@ class Fitter:
             windows = count_windows(data, method.objective(data).horizon)
             if not method.batch_size:
                 method = method.replace(batch_size=default_batch_size(windows))
-        plan = Plan(method, data, _header(method, name, data), self._folder / f"{name}{SUFFIX}")
+        plan = FitPlan(method, data, _header(method, name, data), self._folder / f"{name}{SUFFIX}")
         plan.find()  # another encoder there is a mistake
         return plan
 
@@ -139,7 +137,7 @@ class Fitter:
         coordinates = tried_coordinates(self._data.task, method.on, method.leave_out)
         return self._data.rescaled(method.scaling, coordinates, method.clip, method.keep)
 
-    def _make_once(self, plan: Plan) -> bool:
+    def _make_once(self, plan: FitPlan) -> bool:
         make_folder(self._folder)
         with exclusive(plan.path, beside=True):
             if plan.is_complete():
@@ -147,14 +145,14 @@ class Fitter:
             self._make(plan)
             return True
 
-    def _make(self, plan: Plan) -> None:
+    def _make(self, plan: FitPlan) -> None:
         match plan.method:
             case ClosedForm() as method:
                 self._save(plan, method.make(plan.data))
             case Learned() as method:
                 self._train(plan, method)
 
-    def _train(self, plan: Plan, method: Learned) -> None:
+    def _train(self, plan: FitPlan, method: Learned) -> None:
         work = plan.path.with_suffix(".training")
         make_folder(work)
         header, objective = plan.header, method.objective(plan.data).to(self._device)
@@ -167,7 +165,7 @@ class Fitter:
             trainer.restore(identity, saved)
         try:
             with SummaryWriter(str(work), purge_step=len(trainer.history) + 1) as scalars:
-                for _ in _with_progress(trainer, header.name):
+                for _ in trainer.with_progress(header.name):
                     for name, value in trainer.history[-1]._asdict().items():
                         scalars.add_scalar(name, value, len(trainer.history))
                     trainer.save(identity, saved)
@@ -183,7 +181,7 @@ class Fitter:
             self._windows = {key: (train, watched_windows(data, horizon, self._device))}
         return self._windows[key]
 
-    def _save_best(self, plan: Plan, trainer: Trainer, watched: Windows) -> None:
+    def _save_best(self, plan: FitPlan, trainer: Trainer, watched: Windows) -> None:
         objective = trainer.objective
         objective.load_state_dict(trainer.best)
         best = trainer.best_epoch
@@ -198,7 +196,7 @@ class Fitter:
             metrics |= objective.report(watched)
             self._save(plan, Made(*objective.layers(), metrics))
 
-    def _save(self, plan: Plan, made: Made) -> None:
+    def _save(self, plan: FitPlan, made: Made) -> None:
         method, data = plan.method, plan.data
         parts = complete(made, data, method.codes, method.keep)
         encoder = Encoder(plan.header, data.scaler, *parts)
@@ -231,15 +229,6 @@ def _origin(header: EncoderHeader) -> dict[str, Any]:
     return {**USUAL, **header.training, **of, "data": header.data.get("fingerprint")}
 
 
-def _with_progress(trainer: Trainer, name: str) -> Iterator[Epoch]:
-    total, done = trainer.schedule.epochs, len(trainer.history)
-    with Progress(total=total, initial=done, desc=name, unit="epoch") as progress:
-        for epoch in trainer.epochs():
-            progress.set_postfix(train=f"{epoch.train_loss:.5f}", test=f"{epoch.test_loss:.5f}")
-            progress.update()
-            yield epoch
-
-
 def complete(
     made: Made, data: ScaledDataset, codes: str = "raw", keep: tuple[str, ...] = ()
 ) -> tuple[Layers, Layers, tuple[str, ...]]:
@@ -254,7 +243,8 @@ def complete(
     if codes != "raw" or decoder is None:
         moments, shared = _code_moments(encoder, data)
         if decoder is None:
-            decoder = (_best_decoder(moments, shared, data),)
+            weight = shared.T @ np.linalg.pinv(moments.covariance, hermitian=True)
+            decoder = (dense(weight, data.moments.mean - weight @ moments.mean),)
         if codes != "raw":
             encoder, decoder = _rescaled(encoder, decoder, moments, codes)
     if data.size < data.scaler.size:
@@ -275,11 +265,6 @@ def _code_moments(layers: Layers, data: ScaledDataset) -> tuple[Moments, Array]:
     mean = total / count
     covariance = products / count - np.outer(mean, np.concatenate((mean, data.moments.mean)))
     return Moments(mean, covariance[:, :size]), covariance[:, size:]
-
-
-def _best_decoder(moments: Moments, shared: Array, data: ScaledDataset) -> Layer:
-    weight = shared.T @ np.linalg.pinv(moments.covariance, hermitian=True)
-    return dense(weight, data.moments.mean - weight @ moments.mean)
 
 
 def _rescaled(

@@ -174,7 +174,7 @@ class Forward(Network, Learned, frozen=True, kw_only=True):
     changes: ChangesWeight = 1.0
     values: ValuesWeight = 1.0
     reward: RewardWeight = 1.0
-    inverse: Annotated[Weight, Meta(description="Weight of the action, from now and later.")] = 0.0
+    inverse: Annotated[Weight, Meta(description="Weight of the action, from both latents.")] = 0.0
 
     def check_data(self, data: ScaledDataset) -> None:
         super().check_data(data)

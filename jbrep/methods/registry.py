@@ -42,28 +42,28 @@ def with_preset(kind: str, preset: str | None, settings: Mapping[str, Any]) -> d
     return {**choose(preset, method.presets, f"preset of {kind}"), **settings}
 
 
-def each_named(
+def named_settings(
     kind: str, latents: Sequence[Any], seeds: int | None, name: str | None, settings: dict[str, Any]
 ) -> list[tuple[str | None, dict[str, Any]]]:
-    """The name and settings of several encoders: one of each latent size and seed.
+    """Names and settings of encoders, one for each latent size and seed, 0 to n - 1.
 
-    A name that isn't given is left out where it needs no seed: data may say more of it. There are
-    no `latents` of a kind that has none, and the `seeds` are 0 to n - 1, or the usual one.
+    A name is None where neither the user nor a seed determines it: data may add to it. `latents` is
+    empty for a kind without sizes.
     """
     method = get_method(kind)
     if name and len(latents) > 1:
         raise InputError("one `name` is for one latent size: give each its own")
-    each = [{**settings, "latent": size} for size in latents] or [settings]
-    named = [(name_of(method.of(one)), one) for one in each]  # a mistake shows before data are read
+    per_size = [{**settings, "latent": size} for size in latents] or [settings]
+    usual = [name_of(method.of(each)) for each in per_size]  # a mistake shows before data are read
     if seeds is None:
-        return [(name, one) for one in each]
+        return [(name, each) for each in per_size]
     if not method.takes("seed"):
         raise InputError(f"{kind} has no seed, so all its encoders are the same: leave out `seeds`")
     if "seed" in settings:
         raise InputError("--seed is for one encoder: leave it out, or `seeds`")
     return [
-        (of_seed(name or called, seed), {**one, "seed": seed})
-        for called, one in named
+        (of_seed(name or default, seed), {**each, "seed": seed})
+        for default, each in zip(usual, per_size, strict=True)
         for seed in range(seeds)
     ]
 

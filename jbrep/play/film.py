@@ -47,9 +47,9 @@ class Film:
                 f"{len(self.rollouts)} pictures side by side are {self.width:,} pixels wide: at "
                 f"most {_WIDEST:,} are possible; choose a smaller `size`"
             )
-        first, *_ = starts = [_start(rollout) for rollout in self.rollouts]
+        starts = [_start(rollout) for rollout in self.rollouts]
         for rollout, start in zip(self.rollouts, starts, strict=True):
-            if start != first:
+            if start != starts[0]:
                 raise InputError(
                     f"{self.rollouts[0].name} and {rollout.name} differ in their task or start: "
                     "only episodes that share both can be shown side by side, as those of policies "

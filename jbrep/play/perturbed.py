@@ -47,7 +47,7 @@ class Row(Record, frozen=True, kw_only=True):
 HEADER = ("perturbation", "median return [10, 90 %]", "share of the mean [95 %]")
 
 
-class Table(Document, frozen=True, kw_only=True):
+class PerturbationTable(Document, frozen=True, kw_only=True):
     """What a policy returns from the same starts in several domains, the first one undisturbed."""
 
     format = "jbrep perturbations"

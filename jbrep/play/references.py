@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.envs.task import Array, Task
-from jbrep.jitterbug.heuristics import HEURISTICS
+from jbrep.jitterbug.tasks import jitterbug_task
 from jbrep.play.sources import find_player
 from jbrep.records.tables import rounded as as_in_tables
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within
@@ -30,7 +30,7 @@ _WORDS = {
 
 def policies_of(task: Task) -> list[str]:
     """The names of the reference policies that a task has."""
-    return [policy for policy in _POLICIES if policy != LOOKING or task.name in HEURISTICS]
+    return [policy for policy in _POLICIES if policy != LOOKING or jitterbug_task(task)]
 
 
 def play(policy: str, task: Task, episodes: int) -> list[float]:

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from jbrep.collecting.policies import POLICIES, Own, Policy, parse_policy
+from jbrep.collecting.policies import POLICIES, Policy, UserPolicy, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import FULL
@@ -55,11 +55,11 @@ def find_policy(given: Any, folder: Path, task: Task) -> Policy:
 
     It is named by the folder of a run, the file of a policy, a name such as constant:drive=0.5,
     code, mymodule:act, or a mixture such as uniform:0.5+runs/a:0.5; or it is a user's own object,
-    as `Own` takes it. The policy of a run is frozen: it is the one that the data set has already,
-    or else the run's last.
+    as `UserPolicy` takes it. The policy of a run is frozen: it is the one that the data set has
+    already, or else the run's last.
     """
     if not isinstance(given, (str, Path)):
-        return Own.of(given)
+        return UserPolicy.of(given)
     taken: list[str] = []
 
     def frozen(part: str) -> Policy | None:
@@ -97,13 +97,9 @@ def check_source(source: str) -> None:
     check_begun(Path(source))
     raise InputError(
         f"{source} is no data set, no run with a policy or checkpoint, no exported policy, and no "
-        f"policy by name: those are {policy_names()}, and your own as module:function"
+        f"policy by name: those are {', '.join((*POLICIES, SHIPPED))}, and your own as "
+        "module:function"
     )
-
-
-def policy_names() -> str:
-    """The names of policies, for messages."""
-    return ", ".join((*POLICIES, SHIPPED))
 
 
 def policy_file(source: str, task: Task | None) -> Path:
@@ -117,14 +113,15 @@ def find_player(source: Any, task: Task | None = None, encoder: Any = None) -> P
     Args:
         source: the folder of a run, or a policy in it, which plays its last checkpoint if it is not
             over; the file of a policy, also an exported one; a name, such as constant:drive=0.5, or
-            trained, which ships for the task; or what `Own` takes, or its code, mymodule:act.
+            trained, which ships for the task; or what `UserPolicy` takes, or its code, such as
+            mymodule:act.
         task: for a policy by its name or a user's own. Others have their own; if one is given, it
             must be of the same environment, and is played instead: with other arguments or another
             time limit.
         encoder: the one that a run was made with, if that is a user's own.
     """
     if not isinstance(source, (str, Path)):
-        own = Own.of(source)
+        own = UserPolicy.of(source)
         return Player(own.name, _needed(task, own.name), own.begin)
     source = str(source)
     if is_trained(source):
@@ -218,7 +215,7 @@ def as_player(name: str, trained: "Trained", task: Task | None = None) -> Player
 # policies in exported files, played as a robot would run them
 
 
-class Described(msgspec.Struct):
+class PolicyMetadata(msgspec.Struct):
     """What playing needs of what an exported policy says of itself."""
 
     environment: Task
@@ -226,25 +223,25 @@ class Described(msgspec.Struct):
     chunk: Annotated[int, Meta(ge=1)] = 1
 
 
-def read_exported(path: Path) -> tuple[Any, Described]:
+def read_exported(path: Path) -> tuple[Any, PolicyMetadata]:
     """The session of onnxruntime that computes a policy's actions, and what the file says of it."""
     from jbrep.encoders.imported import session  # imports onnx
     from jbrep.rl.controller import NOT_SEALED, SEAL
 
     what = f"{path} isn't an ONNX model that can be run"
     content = read_file(path)
-    with refusing(what, told=first_line, kind=DamageError):
+    with refusing(what, describe=first_line, kind=DamageError):
         made = session(content)
         known = made.get_modelmeta().custom_metadata_map
     try:
-        told = msgspec.json.decode(known.get("jbrep", ""), type=Described)
+        metadata = msgspec.json.decode(known.get("jbrep", ""), type=PolicyMetadata)
     except msgspec.DecodeError:  # also of a field that doesn't fit
         raise InputError(f"{path} isn't a policy that jbrep policy export wrote") from None
     seal = known.get(SEAL, "")
     plain = content.replace(seal.encode(), NOT_SEALED.encode()) if seal else content
     if hashlib.sha256(plain).hexdigest() != seal:
         raise DamageError(f"{path} is damaged: it isn't what was exported, by its SHA-256")
-    return made, told
+    return made, metadata
 
 
 def is_exported(source: str) -> bool:
@@ -269,7 +266,7 @@ def _exported(path: Path, task: Task | None) -> Player:
         )
 
     def act(observation: Array) -> NDArray[Any]:
-        with refusing(f"{path} can't be run", told=first_line):
+        with refusing(f"{path} can't be run", describe=first_line):
             (action,) = session.run([made.name], {given.name: observation.astype("float32")})
         return action
 

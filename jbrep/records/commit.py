@@ -55,7 +55,7 @@ def _commit(folder: Path) -> str:
 def _git(folder: Path, *arguments: str) -> str:
     command = ("git", "--no-optional-locks", "-C", str(folder), *arguments)
     try:
-        told = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
+        process = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
     except (OSError, subprocess.SubprocessError):
         return ""
-    return told.stdout.decode(errors="replace").strip() if told.returncode == 0 else ""
+    return process.stdout.decode(errors="replace").strip() if process.returncode == 0 else ""

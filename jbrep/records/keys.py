@@ -46,8 +46,8 @@ def keys_of(kind: type[Record]) -> list[Key]:
     assert isinstance(node, inspect.StructType)
     keys = []
     for each, field in zip(node.fields, msgspec.structs.fields(kind), strict=True):
-        told = each.type if isinstance(each.type, inspect.Metadata) else None
-        words, extra = (told.extra_json_schema, told.extra) if told else (None, None)
+        meta = each.type if isinstance(each.type, inspect.Metadata) else None
+        words, extra = (meta.extra_json_schema, meta.extra) if meta else (None, None)
         help_ = (words or {}).get("description", "")
         default = default_of(field)
         keys.append(Key(each.encode_name, each.name, field.type, default, help_, extra or {}))

@@ -34,11 +34,6 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]])
 def write_text(path: Path, text: str) -> str:
     """The same of a table as text."""
     write_whole(path, text.encode())
-    return hash_of(text)
-
-
-def hash_of(text: str) -> str:
-    """The SHA-256 of a table as text."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -9,13 +9,13 @@ from jbrep.evaluation.evaluation import Diagnostics, Evaluation, Lost, Score
 from jbrep.reporting.views import say
 from jbrep.text import SIGNIFICANT, Table, facts, number, r2_text, wrapped
 
-_MEASURES = {  # of which the first that the full observation tells anything of counts
+_MEASURES = {  # the first that the full observation predicts decides
     "rewarded": "the change of what the reward depends on",
     "reward": "the reward",
     "mean": "the features' change",
 }
-_TOLD = 0.1  # R² of it from the full observation, at least
-AS_GOOD = 0.9  # the share of the best R² from which a code serves as well
+_PREDICTED = 0.1  # least R² that counts as predicted
+AS_GOOD = 0.9  # share of the best R² that is enough
 _MANY = 8  # features that are named
 _CHOSEN_BY = "rewarded"  # whose interval is shown
 
@@ -24,9 +24,9 @@ class Advice(NamedTuple):
     """Which encoders retain enough for a controller."""
 
     by: str  # what decides, in words
-    enough: Sequence[str] = ()  # the encoders that do, the best first
+    enough: Sequence[str] = ()  # encoders that do, best first
     recommended: str | None = None  # the smallest of these, if possible one that misses nothing
-    nearest: str | None = None  # where none does, the one that comes nearest, if one does
+    nearest: str | None = None  # where none does, the one that comes nearest, if any
     unknown: str = ""  # why nothing can be said; empty where something can
 
 
@@ -54,23 +54,23 @@ def judge(evaluation: Evaluation) -> Advice:
     for name in _MEASURES:
         scores = {label: known.ahead(name) for label, known in evaluation.encoders.items()}
         r2 = {label: (score and score.value) or 0.0 for label, score in scores.items()}
-        if r2[FULL] >= _TOLD:
+        if r2[FULL] >= _PREDICTED:
             break
     else:
-        nothing = (
-            f"even the full observation predicts next to nothing of these "
+        unpredictable = (
+            f"even the full observation predicts almost nothing on these "
             f"{evaluation.data.test_rows:,} held-out steps"
         )
-        return Advice("", unknown=nothing if horizon else untold(evaluation))
+        return Advice("", unknown=unpredictable if horizon else untold(evaluation))
     by = f"R² of {_MEASURES[name]} over {horizon} steps, at least {AS_GOOD:.0%} of the best"
-    misses, least = missed(evaluation), AS_GOOD * max(r2.values())
-    codes = sorted((label for label in r2 if label != FULL), key=lambda label: -r2[label])
-    enough = [label for label in codes if r2[label] >= least]
-    some = [label for label in codes if r2[label] >= _TOLD]
-    nearest = min(some, key=lambda label: bool(misses[label]), default=None)
-    whole = [label for label in enough if not misses[label]]
+    misses, threshold = missed(evaluation), AS_GOOD * max(r2.values())
+    ranked = sorted((label for label in r2 if label != FULL), key=lambda label: -r2[label])
+    enough = [label for label in ranked if r2[label] >= threshold]
+    predictive = [label for label in ranked if r2[label] >= _PREDICTED]
+    nearest = min(predictive, key=lambda label: bool(misses[label]), default=None)
+    complete = [label for label in enough if not misses[label]]
     size = {label: evaluation.encoders[label].latent for label in enough}
-    return Advice(by, enough, min(whole or enough, key=size.__getitem__, default=None), nearest)
+    return Advice(by, enough, min(complete or enough, key=size.__getitem__, default=None), nearest)
 
 
 def _headline(evaluation: Evaluation, judged: Advice) -> Table:
@@ -111,15 +111,15 @@ def _hidden(evaluation: Evaluation) -> Iterator[Table]:
 def _missed_text(evaluation: Evaluation, width: int | None) -> str:
     if reason := untold(evaluation):
         return wrapped(f"What each misses isn't known: {reason}.", width)
-    told = {}
+    found = {}
     for label, features in missed(evaluation).items():
         some = [f"{each.name} ({r2_text(each.kept)})" for each in features[:_MANY]]
         more = [f"{len(features) - _MANY} more"] if len(features) > _MANY else []
-        told[label] = ", ".join((*some, *more)) or "nothing"
+        found[label] = ", ".join((*some, *more)) or "nothing"
     unread = [each.name for each in evaluation.encoders[FULL].loses]
     title = wrapped("What each misses of what a controller needs (decoded with R² < 0.5)", width)
     nor = f"The full observation doesn't show {', '.join(unread)} either."
-    lines = [title, facts(told, width, indent=0)] if told else []
+    lines = [title, facts(found, width, indent=0)] if found else []
     return "\n".join((*lines, *([wrapped(nor, width)] if unread else ())))
 
 

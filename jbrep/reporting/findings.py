@@ -281,8 +281,11 @@ def _group(
     del plain["verdicts"]
     for label, of_label in zip(group.labels, plain.pop("labels"), strict=True):
         own = shared.get(f"{group.task}/{group.algorithm}/{label.representation}", {})
-        means = {name: _mean_share(values) for name, values in own.items()}
-        agents.append({**of_label, "rises": label.rises, "shares": means})
+        means = {
+            name: unless_few(mean_within(np.array(values), Bounds(0, 1), LEVEL), len(values))
+            for name, values in own.items()
+        }
+        agents.append({**of_label, "rises": label.rises, "shares": to_plain(means)})
     return Group(
         **plain,
         agents=from_plain(agents, list[Agents]),
@@ -291,26 +294,21 @@ def _group(
     )
 
 
-def _mean_share(values: Sequence[float]) -> list[Any]:
-    mean = mean_within(np.array(values), Bounds(0, 1), LEVEL)
-    return unless_few(mean, len(values)).tolist()
-
-
 def _runs(tables: Tables) -> list[RunFound]:
     """Every run, with its curve; as shares, numbers that are 0 or 1 in all episodes of a task."""
     returns = by_run(tables.raw.returns)
-    told = dict[tuple[str, int], dict[str, list[float]]]()
+    infos = dict[tuple[str, int], dict[str, list[float]]]()
     of_task = dict[str, dict[str, list[float]]]()
     for row in tables.raw.infos:  # of last evaluations
         if row.step == max(returns.get(run_of(row), ()), default=None):
-            told.setdefault(run_of(row), {}).setdefault(row.name, []).append(row.value)
+            infos.setdefault(run_of(row), {}).setdefault(row.name, []).append(row.value)
             of_task.setdefault(row.task, {}).setdefault(row.name, []).append(row.value)
     known = {task: shares(values) for task, values in of_task.items()}
     found = []
     for run in tables.raw.record.runs:
         of_run = returns.get((run.label, run.seed), {})
         fewest = min(map(len, of_run.values()), default=0)  # the last evaluation may have more
-        own = {} if run.status == FAILED else told.get((run.label, run.seed), {})
+        own = {} if run.status == FAILED else infos.get((run.label, run.seed), {})
         of_its_task = known.get(run.label.rsplit("/", 2)[0], {})
         found.append(
             RunFound(

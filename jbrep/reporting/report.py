@@ -135,11 +135,11 @@ def commands(found: Findings) -> Mapping[str, str]:
         f"In a checkout of jbrep {versions['jbrep']}, with these versions (equal results also need "
         "the same kind of processor):"
     )
-    told = {checkout: f"pip install '.[learn]' {packages}"}
+    steps = {checkout: f"pip install '.[learn]' {packages}"}
     if found.study:
-        told["This file, as study.toml:"] = found.study
-        told["All runs:"] = f"jbrep study study.toml --out {folder}{imports}"
-    return {**told, "This report, from the runs:": f"jbrep report {folder}"}
+        steps["This file, as study.toml:"] = found.study
+        steps["All runs:"] = f"jbrep study study.toml --out {folder}{imports}"
+    return {**steps, "This report, from the runs:": f"jbrep report {folder}"}
 
 
 def summary(found: Findings) -> str:

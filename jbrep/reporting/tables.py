@@ -39,10 +39,11 @@ def read_tables(folder: Path) -> Tables:
 def _statistics(tables: study.Tables) -> tuple[Analysis | None, list[str]]:
     """The statistics, if runs allow any; what there are none of, and why."""
     prevented = _prevented(tables.record, tables.references)
+    curves, left_out = tables.curves()
     planned = replace(tables.record.planned, prevented=prevented)
-    compared, left_out = _comparable(tables.curves(), planned.rules.baseline)
+    compared, alone = _comparable(curves, planned.rules.baseline)
     compared, refused = _without_refused(compared, planned.rules.baseline)
-    left_out += refused
+    left_out += alone + refused
     try:
         references = tables.references
         analysis = analyse(compared, planned, references=references) if compared else None

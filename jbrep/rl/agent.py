@@ -70,9 +70,9 @@ def make_env(
     return normalized(VecMonitor(envs)) if chosen.normalize else VecMonitor(envs)
 
 
-def one_line(told: object) -> str:
+def one_line(problem: object) -> str:
     """The text of an error, or of what else is to be named, for a message."""
-    return textwrap.shorten(str(told), 200)
+    return textwrap.shorten(str(problem), 200)
 
 
 class Spaces(gymnasium.Env[Any, Any]):
@@ -111,8 +111,10 @@ def make_agent(
         size = int(np.prod(env.action_space.shape or (), dtype=int))
         of_class["action_noise"] = noise_of(hyperparameters.noise, size, episode_steps)
     with (
-        warnings.catch_warnings(record=True) as told,
-        refusing("there is no room for the agent and its buffer", (MemoryError,), told=one_line),
+        warnings.catch_warnings(record=True) as caught,
+        refusing(
+            "there is no room for the agent and its buffer", (MemoryError,), describe=one_line
+        ),
     ):
         agent: Any = sb3_class(algorithm)(
             "MlpPolicy",
@@ -127,7 +129,7 @@ def make_agent(
             },
             **of_class,
         )
-    for each in told:
+    for each in caught:
         warnings.warn(one_line(each.message), Notice, stacklevel=2)
     for _, part in trained_parts(agent):
         if isinstance(part, torch.optim.Optimizer):

@@ -200,7 +200,9 @@ class Controller:
             return self._chosen(observation[None])[0]
         action = self.acting.actions(self.encoder.encode(observation))
         if not np.isfinite(action).all():
-            raise InputError("the policy's action is not finite: is its observation usual?")
+            raise InputError(
+                "the policy's action is not finite: is its observation in the usual range?"
+            )
         return action
 
 

@@ -52,8 +52,8 @@ class History:
         """Record an evaluation after so many steps."""
         returns: Sequence[float] = [tables.rounded(each) for each in outcome.returns]
         self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(returns)]
-        told = enumerate(outcome.numbers)
-        self.infos += [Info(step, i, *each) for i, numbers in told for each in numbers.items()]
+        numbered = enumerate(outcome.numbers)
+        self.infos += [Info(step, i, *each) for i, numbers in numbered for each in numbers.items()]
         self.means.append(float(np.mean(returns)))
 
     def drop_from(self, step: int) -> None:

@@ -84,10 +84,10 @@ class Learner(Record, frozen=True, kw_only=True):
         learner = cls.given(start.algorithm, preset or start.preset, overrides, name)
         learner = learner.replace(draws=draws)
         for each in learner.variants:
-            _ = each.hyperparameters
+            _ = each.hyperparameters  # raises if invalid
         presets = {base_name(each, its) for each in ALGORITHMS for its in ALGORITHMS[each].presets}
         if name in presets and learner != cls.of(name):
-            raise InputError(f'it is a preset\'s name: give it another and base = "{base}"')
+            raise InputError(f'that is a preset\'s name: choose another, with base = "{base}"')
         return learner
 
     def overridden(self, overrides: Mapping[str, Any]) -> "Learner":

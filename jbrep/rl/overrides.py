@@ -124,12 +124,6 @@ def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> 
     return after
 
 
-def setting_names(algorithm: str) -> list[str]:
-    """What can be set of an algorithm."""
-    own = _OWN if ALGORITHMS[algorithm].learns_off_policy else _OWN - {"noise", "warm_up"}
-    return sorted({*_parameters(algorithm), *_policy_parameters(algorithm), *own})
-
-
 def check_shape(algorithm: str, hyperparameters: Hyperparameters) -> Hyperparameters:
     """Those of hyperparameters, perhaps a stranger's, that decide which weights a policy has."""
     _check_parts(algorithm, hyperparameters.net_arch)
@@ -155,12 +149,13 @@ def without_buffer(algorithm: str, hyperparameters: Hyperparameters) -> Hyperpar
 def _check_name(algorithm: str, name: str) -> None:
     if name in _REFUSED:
         raise InputError(f"{name} can't be set: {_REFUSED[name]}")
-    names = setting_names(algorithm)
+    own = _OWN if ALGORITHMS[algorithm].learns_off_policy else _OWN - {"noise", "warm_up"}
+    names = sorted({*_parameters(algorithm), *_policy_parameters(algorithm), *own})
     if name not in names:
         meant = [each for each in names if name == "".join(word[0] for word in each.split("_"))]
         near = meant or get_close_matches(name, names, cutoff=0.5)
-        told = f"did you mean {' or '.join(near)}?" if near else f"it has {', '.join(names)}"
-        raise InputError(f"{algorithm} has no setting {name!r}: {told}")
+        hint = f"did you mean {' or '.join(near)}?" if near else f"it has {', '.join(names)}"
+        raise InputError(f"{algorithm} has no setting {name!r}: {hint}")
 
 
 @cache
@@ -223,8 +218,8 @@ def _check_together(algorithm: str, chosen: Hyperparameters) -> None:
         raise InputError("train_freq counts episodes: that needs a num_envs of 1")
     if steps == 0:
         raise InputError(
-            "gradient_steps is 0, with which nothing is learned: it must be above, or -1 for as "
-            "many as there were steps"
+            "gradient_steps is 0, so nothing would be learned: give a positive number, or -1 for "
+            "one for each step"
         )
     if (dropped := given("top_quantiles_to_drop_per_net")) is not None:
         usual = parameters_of(algorithm)[1]["n_quantiles"].default
@@ -238,7 +233,7 @@ def _build(algorithm: str, chosen: Hyperparameters) -> None:
     """Build an agent, so that what stable-baselines3 refuses is known before the first step."""
     small = without_buffer(algorithm, chosen)
     what = f"stable-baselines3 can't make {algorithm} with these settings"
-    with refusing(what, told=one_line), warnings.catch_warnings(), global_random_state_kept():
+    with refusing(what, describe=one_line), warnings.catch_warnings(), global_random_state_kept():
         warnings.simplefilter("ignore")  # training gives them
         env = DummyVecEnv([lambda: Spaces(*_ANY_SPACES)] * chosen.num_envs)
         agent = make_agent(algorithm, small, env, 0)

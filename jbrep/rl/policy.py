@@ -120,7 +120,7 @@ def acting_prefix(policy: BasePolicy) -> str:
 def fill(policy: BasePolicy, weights: Tensors, path: Path) -> None:
     """Put weights, by their names, into a policy or its acting part: all it has, and no others."""
     errors = (AttributeError, RuntimeError, TypeError, ValueError)
-    with refusing(f"{path} doesn't fit the run's settings", errors, told=one_line):
+    with refusing(f"{path} doesn't fit the run's settings", errors, describe=one_line):
         policy.load_state_dict({name: torch.tensor(values) for name, values in weights.items()})
     if not all(bool(torch.isfinite(part).all()) for part in acting(policy).parameters()):
         raise DamageError(f"{path} is damaged: the policy's weights are not finite")
@@ -136,7 +136,7 @@ def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
     small = without_buffer(settings.algorithm, shape)
     what = "no policy can be made from the settings of the run"
     errors = (AssertionError, KeyError, TypeError, ValueError)
-    with refusing(what, errors, told=one_line), global_random_state_kept():
+    with refusing(what, errors, describe=one_line), global_random_state_kept():
         spaces = Spaces(*agent_spaces(task, encoder, settings.chunk))
         agent = make_agent(settings.algorithm, small, spaces, settings.seed)
     statistics = Statistics.untrained(encoder.latent_size) if shape.normalize else None

@@ -24,9 +24,9 @@ from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_EPISODES, Name, Seed, TrainingSettings
 from jbrep.training.trainer import get_device, single_torch_thread
 
-# where a run doesn't say: evaluations before the last, steps between them, and how many times as
-# many episodes the last has
-_EVALUATIONS, _APART, _FINAL = 10, 10_000, 10
+_EVALUATIONS = 10  # before the last, where a run doesn't say
+_APART = 10_000  # steps between them, at least
+_FINAL = 10  # times as many episodes in the last evaluation
 _TRIAL = 300  # steps from which the time of a run is estimated
 
 

@@ -46,22 +46,22 @@ class CloneSettings(Record, frozen=True, kw_only=True):
     ] = BC
     loss: Annotated[
         Literal["squared", "gaussian"],
-        Meta(description="Of cloning: squared error, or a Gaussian's negative log-likelihood."),
+        Meta(description="Cloning: squared error, or a Gaussian's negative log-likelihood."),
     ] = "squared"
     chunk: Annotated[
         int,
         Meta(
             ge=1,
             le=1000,
-            description="Of cloning: actions that are chosen at once and played before the policy "
+            description="Cloning: actions that are chosen at once and played before the policy "
             "looks again.",
         ),
     ] = 1
     patience: Annotated[
-        int, Meta(ge=1, description="Of cloning: epochs without a lower held-out loss that end it.")
+        int, Meta(ge=1, description="Cloning: epochs without a lower held-out loss that end it.")
     ] = 10
     alpha: Annotated[
-        float, Meta(gt=0, le=10**6, description="Of TD3+BC: weight of the value in its actor.")
+        float, Meta(gt=0, le=10**6, description="TD3+BC: weight of the value in its actor.")
     ] = 2.5
 
     def check(self) -> None:

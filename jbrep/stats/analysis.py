@@ -147,10 +147,10 @@ def _analyse_group(
     references: Mapping[str, Sequence[float]],
     seed: int,
 ) -> GroupAnalysis:
-    first, known = evaluated_run(group), compared(group)
-    starts = None
+    first, known, starts = evaluated_run(group), compared(group), None
     if len(first.steps):
-        starts = len(first.evaluations[-1]) if known.on_all_starts else first.returns.shape[1]
+        ends = [r.final for runs in group.values() for r in runs if r.final is not None]
+        starts = len(ends[0]) if known.on_all_starts else first.returns.shape[1]
     played = {
         policy: mean_within(np.array(returns[:starts]), first.bounds, LEVEL)
         for policy, returns in references.items()

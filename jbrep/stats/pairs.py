@@ -67,10 +67,11 @@ class Pair(NamedTuple):
 def pair_of(group: Group, x: str, y: str, seeds: Collection[int]) -> Pair | None:
     """Representations x and y of a group; None where they share fewer than two of the seeds.
 
-    What a failed run counts as is known from runs of these seeds alone, too.
+    What others than these and the baseline return, and with other seeds, makes no difference.
     """
-    counted = with_failure_returns([r for runs in group.values() for r in runs if r.seed in seeds])
-    there = {name: [r for r in counted if r.representation == name] for name in group}
+    names = dict.fromkeys([*[*group][:1], *(name for name in group if name in (x, y))])
+    counted = with_failure_returns([r for n in names for r in group[n] if r.seed in seeds])
+    there = {name: [r for r in counted if r.representation == name] for name in names}
     if not (there[x] and there[y]):
         return None
     return paired(compared({name: runs for name, runs in there.items() if runs}), x, y)

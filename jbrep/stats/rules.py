@@ -143,11 +143,6 @@ class Verdict:
     by: int | None = None  # the steps by which it is so, where a curve of either side still rises
     reason: str | None = None  # why it is not decided, if not because the estimate is too rough
 
-    @property
-    def sentence(self) -> str:
-        """The claim."""
-        return f"{self.x} {self.claim} than {self.y}"
-
 
 @dataclass(frozen=True)
 class Planned:
@@ -186,6 +181,8 @@ class Planned:
             return reason
         for name in (x, y):
             ended = {run.seed for run in group.get(name, ())}.intersection(self.seeds)
+            if not ended:  # those of one run, or beside fewer of the baseline, aren't compared
+                return f"fewer than two runs on {name} or {self.rules.baseline} have ended"
             if len(ended) < len(self.seeds):
                 return f"{len(ended)} of {len(self.seeds)} runs on {name} have ended"
         return pair_of(group, x, y, self.seeds) or "two runs on each side are needed"
@@ -228,13 +225,13 @@ class _Chain:
         last = self.undecided or (self.decided[-1] if self.decided else None)
         for claim in self.claims[len(self.decided) + bool(self.undecided) :]:
             if isinstance(self.pair, str):
-                yield Verdict(**self._told(claim), reason=self.pair)
+                yield Verdict(**self._about(claim), reason=self.pair)
             else:
                 assert last
                 reason = f"not tested: {last.claim!r} is {last.verdict}"
                 yield replace(self._estimated(claim, self.pair, rules, seed), reason=reason)
 
-    def _told(self, claim: Claim) -> dict[str, Any]:
+    def _about(self, claim: Claim) -> dict[str, Any]:
         task, algorithm = self.key
         of = {"task": task, "algorithm": algorithm, "x": self.x, "claim": claim.name, "y": self.y}
         return {**of, "verdict": UNDECIDED}
@@ -248,7 +245,7 @@ class _Chain:
         estimate = UNDEFINED if reason else claim.estimate(pair, LEVEL, seed)
         estimate = unless_few(estimate, pair.units)
         return Verdict(
-            **self._told(claim),
+            **self._about(claim),
             estimate=estimate,
             boundary=boundary,
             interval=UNDEFINED._replace(value=estimate.value),

@@ -49,7 +49,8 @@ class RunCurve:
     top_in_training: float | None = None
     # the return from which on the task counts as solved; None if unknown
     solved: float | None = None
-    environment: str = ""  # what decides which returns there can be; equal likewise
+    environment: str = ""  # what decides which returns there can be; equal for all compared runs
+    learner: str = ""  # a hash of the algorithm's settings; likewise
     # the returns of the last evaluation, if it has more episodes than the others, (f,)
     final: Array | None = None
     encoder_seed: int | None = None  # of the encoder, if the representation has several
@@ -170,19 +171,21 @@ def in_order(names: Iterable[str], baseline: str) -> list[str]:
 def _check_alike(runs: list[RunCurve], name: str) -> None:
     if runs[0].failure_return is None:
         raise InputError(f"{name}: every run failed before its first evaluation: see why they did")
-    if len(environments := sorted({run.environment for run in runs})) > 1:
-        raise InputError(
-            f"{name}: its runs are of different environments: {' and '.join(environments)}; report "
-            "those of one"
-        )
+    for what in ("environment", "learner"):
+        if len(several := sorted({getattr(run, what) for run in runs})) > 1:
+            raise InputError(
+                f"{name}: its runs are of different {what}s: {' and '.join(several)}; report those "
+                "of one"
+            )
     for what, counts in (
         ("evaluations", {run.returns.shape[1] for run in runs if len(run.steps)}),
         ("last evaluations", {len(run.final) for run in runs if run.final is not None}),
     ):
         if len(counts) > 1:
-            told = " and ".join(map(str, sorted(counts)))
+            numbers = " and ".join(map(str, sorted(counts)))
             raise InputError(
-                f"{name}: the {what} of its runs have {told} episodes: report those of one number"
+                f"{name}: the {what} of its runs have {numbers} episodes: report runs with equal "
+                "numbers"
             )
     for label in dict.fromkeys(run.label for run in runs):
         settings = sorted({run.settings for run in runs if run.label == label})

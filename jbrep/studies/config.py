@@ -61,12 +61,12 @@ class Data(Record, frozen=True, kw_only=True):
         str,
         Meta(
             min_length=1,
-            description="That acts, as jbrep collect takes it: uniform, heuristic, trained, a "
+            description="A policy as for jbrep collect: uniform, heuristic, trained, a "
             "run's folder, or a mixture.",
         ),
     ] = UNIFORM
     seed: Annotated[
-        int, Meta(ge=0, le=MAX_ROOT_SEED - MAX_ENCODERS, description="Of the first data set.")
+        int, Meta(ge=0, le=MAX_ROOT_SEED - MAX_ENCODERS, description="Seed of the first data set.")
     ] = 0
     sets: Annotated[
         Annotated[int, Meta(ge=1, le=MAX_ENCODERS)] | None,
@@ -103,7 +103,7 @@ class Data(Record, frozen=True, kw_only=True):
         return {name: value for name, value in to_plain(self).items() if value not in usual}
 
 
-class Described(Record, frozen=True, kw_only=True):
+class TaskTable(Record, frozen=True, kw_only=True):
     """A task and what is said of it, as `jbrep.describe` takes it; features as their file had."""
 
     task: str
@@ -160,7 +160,9 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             "settings, or encoders.",
         ),
     ]
-    seeds: Annotated[tuple[Seed, ...], Meta(min_length=1, description="Of the runs, or how many.")]
+    seeds: Annotated[
+        tuple[Seed, ...], Meta(min_length=1, description="Seeds of the runs, or how many.")
+    ]
     episode_steps: Annotated[
         Annotated[int, Meta(ge=1, le=MAX_EPISODE_STEPS)] | None,
         Meta(description="The time limit.", extra={"default": "each task's own"}),
@@ -189,12 +191,12 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         ),
     ] = UNSET
     learners: Mapping[str, Mapping[str, Any]] = {}  # the tables of algorithms, by name
-    described: Mapping[str, Described] = {}  # and those of tasks
+    described: Mapping[str, TaskTable] = {}  # and those of tasks
     evaluations: Annotated[
         tuple[str, ...],
         Meta(
-            description="From jbrep evaluate, whose diagnostics the report sets against returns; "
-            "{task} stands for each task's name."
+            description="Folders of jbrep evaluate, whose diagnostics the report compares with "
+            "returns; {task} stands for each task's name."
         ),
     ] = ()
     verdicts: Rules = Rules()
@@ -209,7 +211,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if name == "representations":
                 values = [each.name for each in self.observed]
             if len(set(values)) < len(values):
-                raise InputError(f"{name} is {values}: it must have each once")
+                raise InputError(f"{name} is {values}: list each once")
         self._check_tasks()
         check_ranges(self.domain or {})
         self._check_data()
@@ -323,7 +325,14 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                     f"verdicts.claims has {str(claim)!r}: {min(unknown)} is none of the "
                     f"representations, {', '.join(names)}"
                 )
-        without = [task for task in self.tasks if task not in HEURISTICS]
+        given = {task: self.described.get(task, TaskTable(task=task)) for task in self.tasks}
+        without = [
+            task
+            for task, each in given.items()
+            if short.get(each.task, each.task) not in HEURISTICS
+            or each.hide
+            or (each.history or 1) > 1
+        ]
         absolute = all(claim.claim != NOT_WORSE for claim in self.verdicts.stated)
         if without and not absolute and self.verdicts.reference == "":
             raise InputError(
@@ -331,7 +340,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 f"return that scores 1, as {without[0]} has no scripted policy"
             )
         for claim, units in self.units.items():
-            if reason := obstacle(claim, units, self.planned.share):
+            if reason := obstacle(claim, units, self.verdicts.error):  # what others may pass on
                 raise InputError(f"verdicts: no outcome could support {str(claim)!r}: {reason}")
 
     @property
@@ -397,8 +406,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     def notices(self) -> list[str]:
         """What to know before the first run."""
         lines = [
-            f"The seeds, {len(self.seeds)} in number, share the {each.encoders} encoders of "
-            f"{each.name} unevenly."
+            f"{len(self.seeds)} seeds share the {each.encoders} encoders of {each.name} unevenly."
             for each in self.observed
             if len(set(each.shares(self.seeds))) > 1
         ]
@@ -465,13 +473,13 @@ def as_study(given: Mapping[str, Any]) -> Study:
     return from_plain(given, Study)
 
 
-def _task(number: int, of_all: Mapping[str, Any], given: Any) -> Described:
+def _task(number: int, of_all: Mapping[str, Any], given: Any) -> TaskTable:
     """What is said of a task by its table, or by its name alone, and of all."""
     own = given if isinstance(given, Mapping) else {"task": taken_for(given)[0]}
     said = {**of_all, **own}
     if isinstance(path := said.get("features"), str):
         said["features"] = read_toml(Path(path))
-    return from_plain(said, Described, f"tasks[{number}]")
+    return from_plain(said, TaskTable, f"tasks[{number}]")
 
 
 def _read_data(given: Mapping[str, Any] | None) -> Mapping[str, Data] | None:

@@ -110,7 +110,7 @@ def _check_encoder(run: Run) -> None:
 
 
 @dataclass(frozen=True)
-class Made:
+class NeededData:
     """A data set that a study needs for a task, and the encoders that are made from it.
 
     Attributes:
@@ -230,10 +230,10 @@ class Made:
             say(f"{self}: its encoders are evaluated in {path.parent}")
 
 
-def every_made(plan: Plan) -> list[Made]:
+def every_made(plan: Plan) -> list[NeededData]:
     """All data sets of a study."""
     return [
-        Made(plan, task, name, number)
+        NeededData(plan, task, name, number)
         for task in plan.study.tasks
         for name in plan.study.named_data
         for number in range(plan.study.sets(name))
@@ -272,7 +272,7 @@ def prepare(plan: Plan, workers: int = 1) -> None:
         each.evaluate()
 
 
-def _make_all(waiting: Sequence[Made], workers: int) -> None:
+def _make_all(waiting: Sequence[NeededData], workers: int) -> None:
     workers = min(workers, cores(), len(waiting))
     if workers < 2:
         for each in waiting:
@@ -291,7 +291,7 @@ def _make_all(waiting: Sequence[Made], workers: int) -> None:
                 )
 
 
-def _make(threads: int, modules: Iterable[str], made: Made) -> str:
+def _make(threads: int, modules: Iterable[str], made: NeededData) -> str:
     """Make a data set and its encoders, in a worker; what a user did wrong."""
     try:
         import_modules(modules)

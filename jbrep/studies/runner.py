@@ -41,7 +41,7 @@ _WRITE_EVERY = 1.0  # seconds
 _TELL_EVERY = 30.0  # seconds
 
 
-class Outcome(NamedTuple):
+class RunOutcome(NamedTuple):
     """How a run ended."""
 
     name: str
@@ -49,7 +49,7 @@ class Outcome(NamedTuple):
     message: str  # the reason, or how long it took
 
 
-def work(assigned: Assigned, modules: Iterable[str] = ()) -> Outcome | None:
+def work(assigned: Assigned, modules: Iterable[str] = ()) -> RunOutcome | None:
     """Train a run; an error is reported in its outcome and stops no other run.
 
     Args:
@@ -71,13 +71,13 @@ def work(assigned: Assigned, modules: Iterable[str] = ()) -> Outcome | None:
     for leftover in (PROGRESS, ERROR):
         (assigned.folder / leftover).unlink(missing_ok=True)
     message = result.reason or f"{result.seconds / 60:.1f} min"
-    return Outcome(assigned.name, result.status, message)
+    return RunOutcome(assigned.name, result.status, message)
 
 
-def _crashed(assigned: Assigned, error: Exception) -> Outcome:
+def _crashed(assigned: Assigned, error: Exception) -> RunOutcome:
     path = assigned.folder / ERROR
     write_note(path, "".join(traceback.format_exception(error)))
-    return Outcome(assigned.name, CRASHED, f"{first_line(error)}; see {path}")
+    return RunOutcome(assigned.name, CRASHED, f"{first_line(error)}; see {path}")
 
 
 class _Progress:
@@ -85,22 +85,22 @@ class _Progress:
 
     def __init__(self, assigned: Assigned) -> None:
         self._path, self._steps = assigned.folder / PROGRESS, assigned.run.steps
-        self._name, self._written, self._told = assigned.name, 0.0, (time.monotonic(), 0)
+        self._name, self._written, self._reported = assigned.name, 0.0, (time.monotonic(), 0)
 
     def __call__(self, history: History, step: int) -> None:
         now = time.monotonic()
-        before, first = self._told
+        before, first = self._reported
         if now - before >= _TELL_EVERY:
             rate = f", {(step - first) / (now - before):,.0f} a second" if first else ""
             mean = f", mean return {history.means[-1]:.4g}" if history.means else ""
             say(f"{self._name}: {step:,} of {self._steps:,} steps{rate}{mean}")
-            self._told = now, step
+            self._reported = now, step
         if step >= self._steps or now - self._written >= _WRITE_EVERY:
             write_note(self._path, str(step))
             self._written = now
 
 
-Backend = Callable[[Plan, Iterable[Cell], int], Generator[Outcome]]
+Backend = Callable[[Plan, Iterable[Cell], int], Generator[RunOutcome]]
 
 
 def usual_workers(plan: Plan) -> int:
@@ -108,7 +108,7 @@ def usual_workers(plan: Plan) -> int:
     return cores() if plan.device == CPU else 1
 
 
-def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
+def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[RunOutcome]:
     """Bring runs to their end in processes of one thread each; yield the outcomes as they come.
 
     A run whose worker is killed is resumed from its checkpoint by another, up to five times. Closed
@@ -116,21 +116,21 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
     """
     jobs = map(plan.assigned, cells)
     train = partial(work, modules=imported_modules())
-    told = partial(
+    on_stop = partial(
         say, "stopping: the runs under way write their checkpoints; Ctrl-C again ends all"
     )
-    ended = side_by_side(train, lambda: next(jobs, None), workers, _PATIENCE, told)
+    ended = side_by_side(train, lambda: next(jobs, None), workers, _PATIENCE, on_stop)
     with closing(ended):
         for job, outcome in ended:
             yield outcome or _killed(job.name)
 
 
-def _killed(name: str) -> Outcome:
+def _killed(name: str) -> RunOutcome:
     reason = f"its worker was killed {ATTEMPTS} times, perhaps because memory ran out"
-    return Outcome(name, CRASHED, f"{reason}: try fewer `workers`")
+    return RunOutcome(name, CRASHED, f"{reason}: try fewer `workers`")
 
 
-def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
+def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[RunOutcome]:
     """The same on the Ray cluster that RAY_ADDRESS names, or else on a local one.
 
     All nodes need the study's folder at the same path. The runs of a node that dies are resumed on
@@ -152,7 +152,7 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome
                 yield _killed(cell.name)
             except ray.exceptions.RayError as error:
                 reason = str(error).strip().rpartition("\n")[2]
-                yield Outcome(cell.name, CRASHED, reason)
+                yield RunOutcome(cell.name, CRASHED, reason)
     finally:
         for job in under_way:
             ray.cancel(job, force=True)

@@ -98,12 +98,15 @@ class Tables(NamedTuple):
     infos: list[RunInfo]
     references: References
 
-    def curves(self) -> list[RunCurve]:
-        """The returns of each run over training, and what they are held against."""
-        evaluated = by_run(self.returns)
-        return [
-            _curve(self, run, evaluated.get((run.label, run.seed), {})) for run in self.record.runs
-        ]
+    def curves(self) -> tuple[list[RunCurve], list[str]]:
+        """The returns of each run over training, and what they are held against; what can't be."""
+        evaluated, found, refused = by_run(self.returns), list[RunCurve](), list[str]()
+        for run in self.record.runs:
+            try:
+                found.append(_curve(self, run, evaluated.get((run.label, run.seed), {})))
+            except InputError as error:  # such as a policy that was cloned, without a curve
+                refused.append(str(error))
+        return found, refused
 
 
 def has_runs(folder: Path) -> bool:
@@ -232,8 +235,8 @@ def play_references(folder: Path) -> None:
                 try:
                     played = play(policy, task, episodes[name])
                 except Exception as error:  # what has been trained is reported all the same
-                    told = f"policy {policy!r} couldn't be played on {name}: {error}"
-                    warnings.warn(told, Notice, stacklevel=2)
+                    problem = f"policy {policy!r} couldn't be played on {name}: {error}"
+                    warnings.warn(problem, Notice, stacklevel=2)
             if damage and not played:
                 raise damage
             rows += (_Reference(name, policy, i, each) for i, each in enumerate(played))
@@ -267,7 +270,8 @@ def _curve(tables: Tables, run: RunFacts, by_step: Mapping[int, list[float]]) ->
         algorithm=shared.learner,
         representation=shared.representation,
         seed=run.seed,
-        settings=hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8],
+        settings=_hash(settings),
+        learner=_hash([settings.get(n) for n in ("preset", "overrides", "hyperparameters")]),
         steps=np.array(steps, dtype=np.int64),
         returns=np.array([each[:episodes] for each in returns], float).reshape(
             -1, max(episodes, 1)
@@ -282,11 +286,18 @@ def _curve(tables: Tables, run: RunFacts, by_step: Mapping[int, list[float]]) ->
         top_in_training=_mean(able[:episodes]),
         solved=task.solved_return,
         environment=", ".join(
-            [task.id, *task.given_arguments, counted(task.max_episode_steps, "step")]
+            [
+                *(task.id, *task.given_arguments, counted(task.max_episode_steps, "step")),
+                *([f"domain {task.domain}"] if task.domain else []),
+            ]
         ),
         final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
         encoder_seed=run.encoder_seed,
     )
+
+
+def _hash(settings: Any) -> str:
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _mean(returns: Sequence[float]) -> float | None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 from jbrep.errors import InputError, differences
+from jbrep.progress import Progress
 from jbrep.records import container
 from jbrep.records.record import Finite, Record, from_plain, to_plain
 from jbrep.training.objective import Objective
@@ -112,13 +113,22 @@ class Trainer:
         return losses.index(min(losses)) + 1
 
     def epochs(self, patience: int | None = None) -> Iterator[Epoch]:
-        """Train to the end, yielding each epoch; or until so many were no better than the best."""
+        """Train to the end, or until `patience` epochs bring no improvement, yielding each."""
         with single_torch_thread():
             while len(self.history) < self.schedule.epochs:
                 if patience and len(self.history) - self.best_epoch >= patience:
                     return
                 self._epoch()
                 yield self.history[-1]
+
+    def with_progress(self, name: str, patience: int | None = None) -> Iterator[Epoch]:
+        """The epochs, with a progress bar."""
+        total, done = self.schedule.epochs, len(self.history)
+        with Progress(total=total, initial=done, desc=name, unit="epoch") as progress:
+            for epoch in self.epochs(patience):
+                progress.set_postfix(train=f"{epoch.train_loss:.5f}", test=f"{epoch.test_loss:.5f}")
+                progress.update()
+                yield epoch
 
     def save(self, identity: Mapping[str, Any], path: Path) -> None:
         """Write the state after an epoch, with what must be equal to resume it, as plain JSON."""

@@ -63,7 +63,7 @@ def open_sources(given: Sequence[str], layout: Layout | None = None, missing: st
 
     paths = [Path(each).resolve() for each in given]
     if twice := [each for each, path in zip(given, paths, strict=True) if paths.count(path) > 1]:
-        raise InputError(f"{twice[-1]} is given twice: its episodes would be there twice")
+        raise InputError(f"{twice[-1]} is given twice: leave one out")
     before = _states(paths)
     first, *others = [Source(load_reader(each).read(each), layout, missing) for each in given]
     first.join(*others)
@@ -88,7 +88,7 @@ def load_reader(given: str) -> ModuleType:
     if is_file and suffix not in _FILES:
         raise InputError(f"unknown format '.{suffix}': choose one of {', '.join(_FILES)}")
     if exists(path / MANIFEST):
-        raise InputError(f"{path} is a data set of jbrep's already: there is nothing to import")
+        raise InputError(f"{path} is already a jbrep data set: there is nothing to import")
     if not exists(path) and suffix in _FILES:
         raise InputError(f"there is no file {path}")
     bags = [each.name for each in sorted(path.glob("*")) if each.suffix in (".mcap", ".db3")]

@@ -33,7 +33,7 @@ def frame_of_arrays(name: str, arrays: Mapping[str, Array], **more: Any) -> Fram
     rows = len(arrays[own["action"]]) if "action" in own else 0
     columns, unusable = dict[str, pa.Array](), dict[str, str]()
     for column, each in arrays.items():
-        if each.dtype.kind not in "fiub":
+        if each.dtype.kind not in "fiub" or each.dtype.itemsize > 8:
             unusable[column] = f"of type {each.dtype}, no plain numbers"
         elif is_image(each):
             unusable[column] = "images, or more numbers than features can be"
@@ -66,11 +66,16 @@ def frame_of_steps(
         array_of(name, what, arrays[column])
     known = {what: array_of(name, what, values) for what, values in once.items()}
     check_lengths(name, known, "episodes")
+    known |= {what: flat(each) for what, each in known.items() if what != "final_observation"}
+    if wide := [w for w, each in known.items() if w != "final_observation" and each.ndim > 1]:
+        raise InputError(f"{name} has several {wide[0]}s for each episode: it must be one")
     if "seed" in known and known["seed"].dtype.kind not in "iu":
         raise InputError(f"{name} has seeds of type {known['seed'].dtype}: they must be whole")
     observation, final = own["observation"], known.pop("final_observation", None)
     if final is not None and final.dtype.kind not in "fiub":
-        raise InputError(f"{name} has final observations of type {final.dtype}: no plain numbers")
+        raise InputError(
+            f"{name} has final observations of type {final.dtype}: they must be numbers"
+        )
     row = arrays[observation].shape[1:]
     if not (about.names or about.features):
         numbers = (Feature(name=f"obs_{i}", group="obs") for i in range(math.prod(row)))
@@ -121,8 +126,10 @@ def joined(
         for column in fitting:
             shape = (length, *first[column].shape[1:])
             if (has := getattr(arrays.get(column), "shape", "missing")) != shape:
-                told = f"{name}, {where}: the shape of {column!r} is {has}"
-                raise InputError(f"{told}: it must be {shape}, by its actions and what was before")
+                raise InputError(
+                    f"{name}, {where}: the shape of {column!r} is {has}: expected {shape}, from "
+                    "its actions and earlier episodes"
+                )
     whole = {column: np.concatenate([arrays[column] for arrays in parts]) for column in fitting}
     ends = [*accumulate(lengths)]
 
@@ -155,8 +162,10 @@ def check_lengths(name: str, arrays: Mapping[str, Any], unit: str = "rows") -> N
     first, expected = next(((what, len(each)) for what, each in arrays.items()), ("", 0))
     for what, each in arrays.items():
         if len(each) != expected:
-            has = f"{name} has {expected:,} {unit} of {first}s, and {len(each):,} of {what}s"
-            raise InputError(f"{has}: the two must be equal")
+            raise InputError(
+                f"{name} has {expected:,} {unit} of {first}s, and {len(each):,} of {what}s: the "
+                "two must be equal"
+            )
 
 
 def flat(values: Array) -> Array:

@@ -19,15 +19,15 @@ Array = NDArray[Any]
 _SLACK = 1e-6  # of a step, by which rounding may shift a time
 _LATE = 0.1  # of a step, by which a reading of an even clock may be late and count as on time
 _ALIKE = 0.01  # by which even clocks may differ and count as the same
-_MOST_GROWTH = 1000  # rows for each that was read, where they are more than so many:
-_MOST_SHORT = 1_000_000
-_MOST_NUMBERS = 50_000_000
-_MOST_PASSED = 0.2  # of readings that come no faster than rows, or hardly:
-_AS_FAST = 1.1
+_MOST_GROWTH = 1000  # rows made of each that was read, unless they are few
+_MOST_SHORT = 1_000_000  # rows that count as few
+_MOST_NUMBERS = 50_000_000  # in all columns together
+_MOST_PASSED = 0.2  # share of readings that are skipped without a note
+_AS_FAST = 1.1  # readings a row, up to which that is noted
 _EVEN = 0.1  # by which most steps of an even clock may differ from the median
 
 
-def parts_of(rows: Rows, layout: Layout, leaves: Sequence[Leaf], counts: Counts) -> Iterator[Rows]:
+def in_parts(rows: Rows, layout: Layout, leaves: Sequence[Leaf], counts: Counts) -> Iterator[Rows]:
     """The rows of an episode in parts that are whole and not too long, each row at its time.
 
     Leaves are those of observation, action and reward, in this order.

@@ -68,15 +68,15 @@ def read(given: str) -> Frame:
 def _form(path: Path) -> _Form:
     begin, said, lines = _head(path)
     separator = said or max(_SEPARATORS, key=lines[0].count)
-    with refusing(f"{path} can't be read as rows of text", (csv.Error,), told=first_line):
+    with refusing(f"{path} can't be read as rows of text", (csv.Error,), describe=first_line):
         read = csv.reader(lines, delimiter=separator)
         header, *rows = ([cell.strip() for cell in row] for row in read)
     if any(_type(cell) == pa.float64() and cell.lower() not in _WORDS for cell in header if cell):
         raise InputError(f"{path}, line {begin + 1}: a number where the columns must be named")
     names, units = _names(header)
     if len(rows) > 1 and len(rows[0]) == len(names) and _is_line_of_units(*rows[:2]):
-        told = [cell.strip("[]()").strip() for cell in rows.pop(0)]
-        begin, units = begin + 1, [a or b for a, b in zip(units, told, strict=True)]
+        below = [cell.strip("[]()").strip() for cell in rows.pop(0)]
+        begin, units = begin + 1, [a or b for a, b in zip(units, below, strict=True)]
     decimal = _decimal(path, separator, [cell for row in rows for cell in row])
     types, rewritten = list[pa.DataType](), set[str]()
     for i, name in enumerate(names):
@@ -172,7 +172,7 @@ def _batches(path: Path, form: _Form, columns: list[str]) -> Iterator[pa.RecordB
             for batch in reader:
                 yield _with_times(batch, form)
     except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path}{_told(path, form, first_line(error))}") from None
+        raise InputError(f"{path}{_problem_at(path, form, first_line(error))}") from None
 
 
 def _with_times(batch: pa.RecordBatch, form: _Form) -> pa.RecordBatch:
@@ -182,7 +182,7 @@ def _with_times(batch: pa.RecordBatch, form: _Form) -> pa.RecordBatch:
     return batch
 
 
-def _told(path: Path, form: _Form, problem: str) -> str:
+def _problem_at(path: Path, form: _Form, problem: str) -> str:
     """An error of Arrow's, with line and column; it counts on from the lines before the first."""
 
     def at(row: str | None) -> str:

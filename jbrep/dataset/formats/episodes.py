@@ -55,7 +55,7 @@ def cut(
         if number in known and not (layout.time and number == last):
             raise InputError(
                 f"{name}: episode {number} goes on after its end, or comes in two parts: the "
-                "rows of an episode must stand together, and only its last one be an end"
+                "rows of an episode must stand together, and only its last one be marked an end"
             )
         known.add(number)
         return f"{name}: episode {number}", rows
@@ -89,7 +89,7 @@ def _begins(
     counts: Counts,
 ) -> NDArray[np.bool_]:
     begins, last = np.zeros(len(rows["action"]), bool), before or _some(rows, 0, 1)
-    for flag in {*ENDS} & rows.keys():
+    for flag in (name for name in ENDS if name in rows):
         if not np.isin(rows[flag], (0, 1)).all():
             raise InputError(f"{name} has a {flag} that is neither true nor false, 0 nor 1")
         ended = last[flag][-1:] if before else [False]
@@ -136,14 +136,14 @@ def episode_of(where: str, rows: Rows, once: Mapping[str, Any]) -> Incoming | No
     seed may be known once.
     """
     observation, numbers = rows["observation"], np.arange(len(rows["action"]))
-    for step in np.flatnonzero(rows.get("step", numbers) != numbers)[:1]:
+    if len(wrong := np.flatnonzero(rows.get("step", numbers) != numbers)):
         raise InputError(
-            f"{where} has step {rows['step'][step]:g} where step {step} was expected: its steps "
-            "must be numbered from 0 without a gap"
+            f"{where} has step {rows['step'][wrong[0]]:g} where step {wrong[0]} was expected: its "
+            "steps must be numbered from 0 without a gap"
         )
     following = None
     if "next_observation" in rows:
-        *_, following = after = rows["next_observation"]
+        following = (after := rows["next_observation"])[-1]
         _check_following(where, after[:-1].astype(np.float32), observation[1:].astype(np.float32))
     final = once.get("final_observation", following)
     ended = {name: rows[name][-1] for name in ENDS if name in rows} | {**once}
@@ -181,10 +181,10 @@ def single(where: str, what: str, values: NDArray[np.float64]) -> NDArray[np.flo
     """Numbers in single precision."""
     with np.errstate(over="ignore"):
         rounded = values.astype(np.float32)
-    for step in np.argwhere(~np.isfinite(rounded))[:1, 0]:
+    if len(wrong := np.argwhere(~np.isfinite(rounded))):
         raise InputError(
             f"{where} has a number in its {what} that isn't finite, or beyond 32 bits, at step "
-            f"{step}: correct the data, leave the episode out, or give `missing`"
+            f"{wrong[0, 0]}: correct the data, leave the episode out, or give `missing`"
         )
     return rounded
 
@@ -231,10 +231,10 @@ def _whole_parts(episode: Incoming) -> Iterator[Incoming]:
 
 def _held(episode: Incoming, most: int) -> Incoming:
     """The episode with the last numbers in place of missing ones; an action has none."""
-    for step in np.argwhere(~np.isfinite(episode.action))[:1, 0]:
+    if len(wrong := np.argwhere(~np.isfinite(episode.action))):
         raise InputError(
-            f"{episode.where} lacks its action at step {step}, which can't be held: leave the "
-            "episode out, or give `missing` skip"
+            f"{episode.where} lacks its action at step {wrong[0, 0]}, which can't be held: leave "
+            "the episode out, or give `missing` skip"
         )
     seen = np.concatenate((episode.observation, episode.final[None]))
     reward = np.concatenate(([0.0], episode.reward))  # with the observation after it

@@ -58,6 +58,7 @@ class Frame:
     once: Mapping[str, Array] = field(default_factory=dict)  # ends and seed of each episode, (n,)
     final: Mapping[str, Array] = field(default_factory=dict)  # columns after last actions, (n, ...)
     task: Task | None = None  # that it names, if that is known here
+    own_reward: str = ""  # what has given the rewards, if not the environment
     why_no_task: str = "it names no environment"
     action_bounds: tuple[Array, Array] | None = None  # (k,) each; infinite where there are none
     max_episode_steps: int | None = None  # of a task made from the data alone
@@ -94,16 +95,15 @@ def own_names(name: str, columns: Collection[str]) -> dict[str, str]:
 
 def check_names(name: str, roles: Collection[str], columns: Collection[str]) -> None:
     """Make sure that there is what every data set needs, of these columns."""
-    for needed in {"observation", "action"} - {*roles}:
+    if lacking := [role for role in ("observation", "action") if role not in roles]:
         raise InputError(
-            f"{name} has no {needed}s: of a log name their columns, as in --actions torque "
+            f"{name} has no {lacking[0]}s: for a log, name their columns, as in --actions torque "
             f"--observations 'joint_*'; it has {listed([*columns]) or 'none'}"
         )
     if not {*roles} & {*ENDS, "episode", "step"}:
         raise InputError(
-            f"{name} doesn't tell where an episode ends: give it terminations and truncations, or "
-            "the number of the episode in each row; of a log name the column of times or episodes "
-            "(--time, --episode), or give the --length"
+            f"{name} doesn't say where episodes end: add terminations and truncations, or the "
+            "number of the episode in each row; for a log, give --time, --episode or --length"
         )
 
 

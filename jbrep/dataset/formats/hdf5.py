@@ -61,9 +61,11 @@ def read(given: str) -> Frame:
             "and so on with actions, as robomimic's"
         )
     own = own_names(given, arrays)
-    is_told = own.keys() & {"truncated", "next_observation", "episode", "step"}
-    ends = "no timeouts and no next observations: episodes end where they are terminated alone; "
-    notes = () if is_told else (f"{ends}--length cuts those that a time limit ended",)
+    has_ends = own.keys() & {"truncated", "next_observation", "episode", "step"}
+    ends = (
+        "no timeouts and no next observations: only terminations end episodes; --length cuts more"
+    )
+    notes = () if has_ends else (ends,)
     label = label_of(Path(given).stem)
     return frame_of_arrays(given, arrays, label=label, about=_about(arrays), notes=notes)
 
@@ -80,15 +82,17 @@ def _arrays(group: h5py.Group) -> dict[str, Array]:
     return found
 
 
-def _frame_of_demos(name: str, demos: dict[str, dict[str, Array]], told: Any) -> Frame:
+def _frame_of_demos(name: str, demos: dict[str, dict[str, Array]], env_args: Any) -> Frame:
     early, episodes, after = 0, dict[str, dict[str, Array]](), dict[str, str]()
     for where, arrays in demos.items():
         steps = len(arrays["actions"])
-        told_ends = np.ravel(arrays.pop("dones", np.zeros(steps)))
-        if len(told_ends) != steps or np.isnan(told_ends).any():
-            has = f"{name}, {where} has {len(told_ends)} dones, and {steps} actions"
-            raise InputError(f"{has}: there must be one for each, and none not a number")
-        ends = told_ends > 0
+        dones = np.ravel(arrays.pop("dones", np.zeros(steps)))
+        if len(dones) != steps or np.isnan(dones).any():
+            raise InputError(
+                f"{name}, {where} has {len(dones)} dones for {steps} actions: give one for each, "
+                "none NaN"
+            )
+        ends = dones > 0
         early += int(ends[:-1].sum())
         after = after or {
             _column(each, arrays): _NEXT + each.removeprefix(_NOW)
@@ -101,7 +105,7 @@ def _frame_of_demos(name: str, demos: dict[str, dict[str, Array]], told: Any) ->
     note = f"{counted(early, 'step')} done before the end of a demo: the episode goes on there"
     environment, rate = "", 0.0
     with suppress(ValueError, TypeError, KeyError, AttributeError):
-        known = json.loads(told)
+        known = json.loads(env_args)
         environment = str(known["env_name"])
         rate = float(known["env_kwargs"]["control_freq"])
     columns, place = joined(name, episodes)

@@ -55,11 +55,11 @@ def read(given: str) -> Frame:
     check_plain(folder)
     info = folder / INFO
     with refusing(f"{info} isn't as LeRobot writes it"):
-        told = json.loads(info.read_bytes())
-        version, fps = str(told["codebase_version"]), float(told["fps"])
-        features = {str(name): dict(each) for name, each in told["features"].items()}
-        frames = int(told["total_frames"]) if "total_frames" in told else None
-        offsets = tuple(float(each) for each in told.get(_OFFSETS, ()))
+        meta = json.loads(info.read_bytes())
+        version, fps = str(meta["codebase_version"]), float(meta["fps"])
+        features = {str(name): dict(each) for name, each in meta["features"].items()}
+        frames = int(meta["total_frames"]) if "total_frames" in meta else None
+        offsets = tuple(float(each) for each in meta.get(_OFFSETS, ()))
         images = [name for name, each in features.items() if each["dtype"] in _IMAGES]
     if not version.startswith(_VERSIONS):
         raise InputError(f"{info} is of LeRobot's layout {version}: it must be v3.0 or v2.1")
@@ -186,8 +186,8 @@ def _write_meta(dataset: Dataset, folder: Path, fps: float) -> None:
         features[name] = {"dtype": str(values.dtype), "shape": shape, "names": names.get(name)}
     for name, of in ((_STATE, "observation"), ("action", "action")):
         (low, high), (mean, std) = extrema(dataset[of].chunks()), mean_and_std(dataset[of].chunks())
-        told = {"min": low, "max": high, "mean": mean, "std": std, "count": [len(dataset)]}
-        stats[name] = {what: np.asarray(each).tolist() for what, each in told.items()}
+        statistics = {"min": low, "max": high, "mean": mean, "std": std, "count": [len(dataset)]}
+        stats[name] = {what: np.asarray(each).tolist() for what, each in statistics.items()}
     info = {"codebase_version": "v3.0", "robot_type": None, "fps": fps, "features": features}
     info |= {"total_episodes": count, "total_frames": len(dataset), "total_tasks": 1}
     info |= {"splits": {"train": f"0:{count}"}, "data_path": _DATA, "video_path": None}

@@ -56,12 +56,12 @@ def read(given: str) -> Frame:
             pass
     with refusing(f"{given} can't be read as a Minari data set"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        told = json.loads((folder / _METADATA).read_bytes())
-        if lacking := {"observation_space", "action_space"} - told.keys():
+        metadata = json.loads((folder / _METADATA).read_bytes())
+        if lacking := {"observation_space", "action_space"} - metadata.keys():
             raise InputError(f"{folder / _METADATA} has no {min(lacking)}")  # Minari would run code
         stored = MinariStorage.read(folder)
         seen, actions = stored.observation_space, stored.action_space
-        name = f"Minari {told.get('dataset_id', given)}"
+        name = f"Minari {metadata.get('dataset_id', given)}"
         features = tuple(features_of(name, seen))
         if not isinstance(actions, spaces.Box) or actions.dtype.kind != "f":
             raise InputError(f"{name} has actions in {actions}: only continuous ones are possible")
@@ -72,9 +72,9 @@ def read(given: str) -> Frame:
             arrays["action"] = _flat(actions, episode["actions"])
             episodes[f"episode {number}"] = arrays
         seeds = [each.get("seed") for each in stored.get_episode_metadata(numbers)]
-        own = told.get(_OWN, {})
-        offsets, own_rewards = (*map(float, own.get("offsets", ())),), own.get("own_rewards")
-    task, why_not, label, limit = _task(told, label_of(name), (len(features), flatdim(actions)))
+        own = metadata.get(_OWN, {})
+        offsets, own_reward = (*map(float, own.get("offsets", ())),), own.get("own_reward", "")
+    task, why_not, label, limit = _task(metadata, label_of(name), (len(features), flatdim(actions)))
     columns, place = joined(name, episodes)
     about = About(features=task.features if task else features, offsets=offsets)
     return frame_of_steps(
@@ -84,7 +84,8 @@ def read(given: str) -> Frame:
         about,
         label=label,
         place=place,
-        task=without_range(task) if task and own_rewards else task,
+        task=without_range(task) if task and own_reward else task,
+        own_reward=own_reward,
         why_no_task=why_not,
         action_bounds=(actions.low.ravel(), actions.high.ravel()),
         max_episode_steps=limit,
@@ -105,11 +106,11 @@ def _folder(given: str) -> Path:
 
 
 def _task(
-    told: dict[str, Any], label: str, sizes: tuple[int, int]
+    metadata: dict[str, Any], label: str, sizes: tuple[int, int]
 ) -> tuple[Task | None, str, str, int | None]:
     """The task, if its environment can be made here, or why not; a label, and the time limit."""
     try:
-        spec = json.loads(told["env_spec"])
+        spec = json.loads(metadata["env_spec"])
         env_id, arguments, given = spec["id"], dict(spec["kwargs"]), spec["max_episode_steps"]
         limit = int(given) if given else None
     except (KeyError, ValueError, TypeError):
@@ -155,7 +156,7 @@ def write(dataset: Dataset, out: Path) -> str:
     namespace = namespace if len(namespace) > 1 else f"task-{namespace}"  # no single letter
     name = f"{namespace}/{settings.policy['kind']}-v0"
     dataset["reward"]  # says what to do if there are none
-    own: dict[str, Any] = {"own_rewards": True} if settings.reward else {}
+    own: dict[str, Any] = {"own_reward": settings.reward} if settings.reward else {}
     own |= {"offsets": task.offset.tolist()} if task.offset.any() else {}
     about = {
         "dataset_id": name,

@@ -54,7 +54,7 @@ def opened(path: Path) -> Iterator[pq.ParquetFile]:
     """A file of any name, whose pages' checksums are compared."""
     errors = (OSError, KeyError, TypeError, ValueError, pa.ArrowException)
     with (
-        refusing(f"{path} can't be read as a Parquet file", errors, told=first_line),
+        refusing(f"{path} can't be read as a Parquet file", errors, describe=first_line),
         path.open("rb") as file,
         pq.ParquetFile(file, page_checksum_verification=True) as table,
     ):
@@ -70,7 +70,8 @@ def batches_of(paths: list[Path], columns: list[str]) -> Iterator[pa.RecordBatch
 
 def _exported(path: Path, schema: pa.Schema, settings: bytes) -> dict[str, Any]:
     """What a frame has besides, of a table that jbrep exported."""
-    task = from_plain(parse_json(settings, path, "jbrep")["environment"], Task)
+    known = parse_json(settings, path, "jbrep")
+    task = from_plain(known["environment"], Task)
     if not {*task.feature_names} <= {*schema.names}:
         return {}
     beside = _beside(path)
@@ -81,12 +82,13 @@ def _exported(path: Path, schema: pa.Schema, settings: bytes) -> dict[str, Any]:
         episodes = file.read()
         final = np.stack(episodes["final_observation"].to_numpy())
         once = {name: episodes[name].to_numpy() for name in (*ENDS, "seed")}
-    told = zip(task.features, task.offset.tolist(), strict=True)
+    offsets = zip(task.features, task.offset.tolist(), strict=True)
     return {
         "task": task,
+        "own_reward": known.get("reward", ""),
         "once": once,
         "final": dict(zip(task.feature_names, final.T, strict=True)),
-        "about": {each.name: About(units=(each.unit,), offsets=(by,)) for each, by in told},
+        "about": {each.name: About(units=(each.unit,), offsets=(by,)) for each, by in offsets},
     }
 
 

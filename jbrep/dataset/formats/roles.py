@@ -47,31 +47,31 @@ Roles = Mapping[str, list[Leaf]]  # by the keys of ALIASES, and time
 
 
 def roles_of(frame: Frame, layout: Layout) -> Roles:
-    """Which columns are what."""
+    """The role of each column."""
     name, names = frame.name, frame.schema.names
     if twice := [each for each, n in Counter(names).items() if n > 1]:
         raise InputError(f"{name} has two columns {twice[0]!r}: rename one")
     leaves = [leaf for each in frame.schema for leaf in _leaves(frame, each)]
     for column, unit in layout.units.items():
-        meant = {*_matching(frame, leaves, (column,))}
-        leaves = [each._replace(unit=unit) if each in meant else each for each in leaves]
-    own = own_names(name, [*names, *frame.unusable])
-    said = {role: (column,) for role, column in own.items()} | _said(layout)
+        matched = {*_matching(frame, leaves, (column,))}
+        leaves = [each._replace(unit=unit) if each in matched else each for each in leaves]
+    by_alias = own_names(name, [*names, *frame.unusable])
+    patterns = {role: (column,) for role, column in by_alias.items()} | _patterns(layout)
     for role in ["step"] * bool(layout.time) + ["reward"] * is_code(layout.reward):
-        said.pop(role, None)  # times tell more than numbers of steps
-    roles = {role: _matching(frame, leaves, some) for role, some in said.items()}
+        patterns.pop(role, None)  # times say more than step numbers
+    roles = {role: _matching(frame, leaves, columns) for role, columns in patterns.items()}
     roles.setdefault("action", [each for each in leaves if _ACTION.fullmatch(each.column)])
-    taken = {*own.values()} | {each.name for some in roles.values() for each in some}
-    others = [each for each in leaves if not {each.name, each.column} & taken]
-    others = [each for each in others if not _NOT_FEATURES.fullmatch(each.column)]
+    used = {*by_alias.values()} | {each.name for some in roles.values() for each in some}
+    unused = [each for each in leaves if not {each.name, each.column} & used]
+    unused = [each for each in unused if not _NOT_FEATURES.fullmatch(each.column)]
     if "observation" not in roles:
         own_features = frame.task and _matching(frame, leaves, frame.task.feature_names)
-        roles["observation"] = own_features or others
-    seen = roles["observation"]
-    angles = {*_matching(frame, seen, layout.angles, "observation")}
-    roles["observation"] = [each._replace(is_angle=each in angles) for each in seen]
+        roles["observation"] = own_features or unused
+    observed = roles["observation"]
+    angles = {*_matching(frame, observed, layout.angles, "observation")}
+    roles["observation"] = [each._replace(is_angle=each in angles) for each in observed]
     if layout.observations:
-        roles["next_observation"] = _after(frame, leaves, seen)
+        roles["next_observation"] = _after(frame, leaves, observed)
     roles = {role: some for role, some in roles.items() if some}
     check_names(name, [*roles, *(["step"] if layout.time or layout.length else [])], names)
     for role, some in roles.items():
@@ -79,8 +79,10 @@ def roles_of(frame: Frame, layout: Layout) -> Roles:
             raise InputError(f"{name} has {len(some)} numbers of the {role} in a row: too many")
     for each in [] if layout.actions else roles["action"]:
         if not pa.types.is_floating(each.kind):
-            has = f"{name} has {each.kind} in the column {each.column!r}"
-            raise InputError(f"{has}: actions must be continuous; if it is, name the actions")
+            raise InputError(
+                f"{name} has {each.kind} in the column {each.column!r}: actions must be "
+                "continuous; if it is, name the actions"
+            )
     return roles
 
 
@@ -89,8 +91,10 @@ def _leaves(frame: Frame, column: pa.Field) -> Iterator[Leaf]:
     places: list[int | None] = [None] if size is None else [*range(size)]
     for what, said in about._asdict().items():
         if said and len(said) != len(places):
-            has = f"{frame.name} has {what} of {len(said)} numbers of {column.name!r}"
-            raise InputError(f"{has}: they must be of {len(places)}")
+            raise InputError(
+                f"{frame.name} has {what} of {len(said)} numbers of {column.name!r}: they must be "
+                f"of {len(places)}"
+            )
     for i, place in enumerate(places):
         feature = about.features[i] if about.features else None
         own = about.names[i] if about.names else feature.name if feature else ""
@@ -106,11 +110,11 @@ def _leaves(frame: Frame, column: pa.Field) -> Iterator[Leaf]:
         )
 
 
-def _said(layout: Layout) -> dict[str, tuple[str, ...]]:
+def _patterns(layout: Layout) -> dict[str, tuple[str, ...]]:
     once = {role: getattr(layout, role) for role in ("time", "episode", "terminated", "reward")}
-    said = {role: (name,) for role, name in once.items() if name}
+    patterns = {role: (name,) for role, name in once.items() if name}
     wide = {"action": layout.actions, "observation": layout.observations}
-    return said | {role: names for role, names in wide.items() if names}
+    return patterns | {role: names for role, names in wide.items() if names}
 
 
 def _matching(
@@ -120,15 +124,15 @@ def _matching(
     for name in names:
         if name in frame.unusable:
             raise InputError(f"{frame.name}: {name} can't be used: it is {frame.unusable[name]}")
-    own, columns = [each.name for each in leaves], [each.column for each in leaves]
-    return [leaves[i] for i in matching(names, own, columns, f"{frame.name} has no {what}")]
+    names_of, columns = [each.name for each in leaves], [each.column for each in leaves]
+    return [leaves[i] for i in matching(names, names_of, columns, f"{frame.name} has no {what}")]
 
 
-def _after(frame: Frame, leaves: list[Leaf], seen: list[Leaf]) -> list[Leaf]:
+def _after(frame: Frame, leaves: list[Leaf], observed: list[Leaf]) -> list[Leaf]:
     """The columns of the same after the action; none if one is missing."""
     after = {**{name: f"next_{name}" for name in ALIASES["observation"]}, **frame.after}
     places = {(each.column, each.place): each for each in leaves}
-    found = [places.get((after.get(each.column, ""), each.place)) for each in seen]
+    found = [places.get((after.get(each.column, ""), each.place)) for each in observed]
     return [each for each in found if each] if all(found) else []
 
 
@@ -139,11 +143,11 @@ def is_of_task(frame: Frame, roles: Roles) -> bool:
     """
     if not frame.task or any(each.is_angle for each in roles["observation"]):
         return False
-    seen = [(each.short, each.unit) for each in roles["observation"]]
+    observed = [(each.short, each.unit) for each in roles["observation"]]
     names = frame.schema.names
     actions = [(names.index(each.column), each.place or 0) for each in roles["action"]]
     known = [(each.name, each.unit) for each in frame.task.features]
-    return seen == known and actions == sorted(actions)
+    return observed == known and actions == sorted(actions)
 
 
 def features_of(name: str, leaves: list[Leaf]) -> tuple[Feature, ...]:
@@ -214,10 +218,13 @@ def second_of(name: str, time: Leaf) -> float:
     is_stamp = pa.types.is_timestamp(time.kind) or pa.types.is_duration(time.kind)
     is_number = pa.types.is_integer(time.kind) or pa.types.is_floating(time.kind)
     if not (is_stamp or is_number or pa.types.is_decimal(time.kind)):
-        has = f"{name} has {time.kind} in the column {time.column!r}"
-        raise InputError(f"{has}: times must be numbers, timestamps or durations")
+        raise InputError(
+            f"{name} has {time.kind} in the column {time.column!r}: times must be numbers, "
+            "timestamps or durations"
+        )
     unit = "ns" if is_stamp else time.unit or "s"
     if unit not in SECONDS:
-        has = f"{name} has times {time.name!r} in {unit!r}"
-        raise InputError(f"{has}: choose one of {', '.join(SECONDS)}")
+        raise InputError(
+            f"{name} has times {time.name!r} in {unit!r}: choose one of {', '.join(SECONDS)}"
+        )
     return SECONDS[unit]

@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from jbrep.coordinates import wrapped
-from jbrep.dataset.formats.clock import parts_of, same_clock, timestep_of
+from jbrep.dataset.formats.clock import in_parts, same_clock, timestep_of
 from jbrep.dataset.formats.episodes import Counts, Incoming, Rows, cut, episode_of
 from jbrep.dataset.formats.frame import Frame, width
 from jbrep.dataset.formats.roles import (
@@ -96,8 +96,10 @@ class Source:
             differ = [what for what, both in alike.items() if not np.array_equal(*both)]
             differ += [] if same_clock(self.timestep, other.timestep) else ["timestep"]
             if differ:
-                has = f"{other.name} has another {differ[0].replace('_', ' ')} than {self.name}"
-                raise InputError(f"{has}: import it alone")
+                what = differ[0].replace("_", " ")
+                raise InputError(
+                    f"{other.name} has another {what} than {self.name}: import it alone"
+                )
         every, self._others = (self, *others), others
         self.name += f" and {counted(len(others), 'more')}" if others else ""
         self.timestep = self.timestep if all(each.timestep for each in every) else None
@@ -119,7 +121,7 @@ class Source:
         for where, rows in cut(name, self._rows(), self._layout, self._counts):
             ends = {what: values[count] for what, values in known.items() if count < len(values)}
             seed = {"seed": ends.pop("seed")} if "seed" in ends else {}
-            parts = [*parts_of(rows, self._layout, self._leaves, self._counts)]
+            parts = [*in_parts(rows, self._layout, self._leaves, self._counts)]
             for i, part in enumerate(parts):
                 once = (seed if i == 0 else {}) | (ends if i == len(parts) - 1 else {})
                 episode = episode_of(where, part, once)
@@ -207,8 +209,8 @@ class Source:
             column = convert(given)
         except pa.ArrowException:
             for row in range(len(given)):  # which one is it?
-                told = f"{self._at(first + row)}: correct {name!r}, or name other columns"
-                with refusing(told, (pa.ArrowException,), told=first_line):
+                where = f"{self._at(first + row)}: correct {name!r}, or name other columns"
+                with refusing(where, (pa.ArrowException,), describe=first_line):
                     convert(given.take([row]))
             raise
         flat = (column if size is None else column.flatten()).to_numpy(zero_copy_only=False)
@@ -218,9 +220,9 @@ class Source:
         """Refuse numbers that are missing."""
         wrong = np.argwhere(~np.isfinite(values.reshape(len(values), -1)))
         for row, column in wrong[:1].tolist():
-            told = f"{self._at(first + row)}: {self._roles[role][column].name!r} is empty"
+            where = f"{self._at(first + row)}: {self._roles[role][column].name!r} is empty"
             how = "give --missing" if role in (*WIDE, "reward") else "correct it"
-            raise InputError(f"{told}, or no finite number: {how}, or leave the row out")
+            raise InputError(f"{where}, or no finite number: {how}, or leave the row out")
 
     def _at(self, row: int) -> str:
         return f"{self.frame.name}, {self.frame.place(row)}"
@@ -241,12 +243,12 @@ class Source:
             known = leaf.is_angle or (leaf.feature and leaf.feature.is_angle)
             if turn and not known and leaf.unit in ("", *units):
                 given = shlex.join(["--angles", leaf.name, "--units", f"{leaf.name}={unit}"])
-                told = f"{leaf.name} jumps by a full turn, {turn:.4g}"
-                notes.append(f"{told}: if it is an angle, give {given}")
+                note = f"{leaf.name} jumps by a full turn, {turn:.4g}"
+                notes.append(f"{note}: if it is an angle, give {given}")
         if angles := int(self._angles.sum()):
             degrees = int((self._factors != 1).sum())
-            told = f"{counted(angles, 'angle')} brought to [-pi, pi) rad"
-            notes.append(f"{told}, {degrees} of them from degrees")
+            note = f"{counted(angles, 'angle')} brought to [-pi, pi) rad"
+            notes.append(f"{note}, {degrees} of them from degrees")
         return [*dict.fromkeys(chain(notes, *(other.notes() for other in self._others)))]
 
 

@@ -22,7 +22,7 @@ from jbrep.dataset.manifest import Manifest, commit, new_manifest, range_problem
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.rewards import reward_function, without_range
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
-from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
+from jbrep.dataset.settings import IMPORTED, MAX_LETTERS, MOST_SHARDS, SHARD_ROWS
 from jbrep.envs.description import as_task, with_features
 from jbrep.envs.names import is_code, with_digest
 from jbrep.envs.probe import Signals, precision_problems
@@ -32,9 +32,6 @@ from jbrep.progress import Progress
 from jbrep.records.record import converted
 from jbrep.records.storage import check_space, make_folder, publish, unfinished
 from jbrep.text import counted, printable
-
-_SHARD_ROWS = 20_000
-_MOST_SHARDS = 5_000
 
 Array = NDArray[Any]
 Rewards = Callable[[Array, Array], Array]
@@ -222,9 +219,9 @@ def _survey(source: Source, missing: str) -> _Survey:
                 counts["left"] -= len(action)
                 progress.update(len(action))
     if counts["missing"]:
-        told = f"{source.name} had {counted(counts['missing'], 'missing reading')} ({missing})"
-        told += f": {counted(counts['left'], 'step')} left out" if counts["left"] else ""
-        warnings.warn(told, Notice, 2)
+        note = f"{source.name} had {counted(counts['missing'], 'missing reading')} ({missing})"
+        note += f": {counted(counts['left'], 'step')} left out" if counts["left"] else ""
+        warnings.warn(note, Notice, 2)
     if signals is None:
         done = "".join(f"; {counted(n, what)} {how}" for (what, how), n in source.changes().items())
         raise InputError(
@@ -278,12 +275,12 @@ def _from_data(source: Source, survey: _Survey) -> Task:
 
 def _settings(source: Source, survey: _Survey, task: Task, reward: str) -> DataSettings:
     steps = sum(survey.lengths)
-    rows = max(_SHARD_ROWS, steps // _MOST_SHARDS)
+    rows = max(SHARD_ROWS, steps // MOST_SHARDS)
     return DataSettings(
         task=task,
         policy={"kind": IMPORTED, "source": printable(source.name)[-MAX_LETTERS:]},
         unrewarded=UNSET if source.has_rewards or reward else True,
-        reward=with_digest(reward, "reward") if reward else UNSET,
+        reward=with_digest(reward, "reward") if reward else source.frame.own_reward or UNSET,
         steps=steps,
         shard_episodes=max(1, rows * len(survey.lengths) // steps),
     )
@@ -302,7 +299,7 @@ def _fill(
         while some := [*islice(numbered, settings.shard_episodes)]:
             known = joined([_columns(task, *pair, offset, rewards) for pair in some])
             columns = settings.columns(known)
-            for problem in range_problems(task, columns):
+            if problem := next(range_problems(task, columns), None):
                 raise InputError(
                     f"{source.name} doesn't fit {task.name}: {problem}; correct the data, or give "
                     "the task that they are of"

@@ -274,7 +274,7 @@ _PLOTS = (
         "representations",
         "Return over training by representation",
         "Return of the deterministic policy over training: mean and 10 to 90 % over n runs. The "
-        "diamond at the end is the final return of the table, from more starts than the curve has.",
+        "diamond at the end is the final return of the table.",
         _curves,
         line("step", "mean", "p10", "p90", final="final"),
         ("training step", "return"),

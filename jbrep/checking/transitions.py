@@ -30,7 +30,7 @@ _AT_ONCE, _SHORTEST = 8, 20  # environments; steps to which an episode may be cu
 _Columns = tuple[NDArray[Any], ...]
 
 
-class Seen(NamedTuple):
+class Transitions(NamedTuple):
     """n steps of whole episodes, one episode after the other."""
 
     task: Task
@@ -44,7 +44,7 @@ class Seen(NamedTuple):
     policy: NDArray[np.str_]  # what acted, (n,); of data RANDOM, as far as is known
 
 
-class Played(NamedTuple):
+class PlayStats(NamedTuple):
     """What came of playing."""
 
     returns: dict[str, Array]  # of each policy's episodes
@@ -52,7 +52,7 @@ class Played(NamedTuple):
     rate: float  # steps a second
 
 
-def play(task: Task, steps: int, seed: int) -> tuple[Seen, Played]:
+def play(task: Task, steps: int, seed: int) -> tuple[Transitions, PlayStats]:
     """Play each policy for about its share of the steps, at least four episodes, perhaps cut."""
     share = steps // len(POLICIES)
     limit = min(task.max_episode_steps, max(_SHORTEST, share // _FEWEST))
@@ -78,10 +78,10 @@ def play(task: Task, steps: int, seed: int) -> tuple[Seen, Played]:
                     episodes.append(_columns(len(episodes), rows, action, own[-1], ended, name))
             returns[name] = np.array([each.sum() for each in own])
     seen = _joined(task, episodes)
-    return seen, Played(returns, limit, len(seen.reward) / seconds)
+    return seen, PlayStats(returns, limit, len(seen.reward) / seconds)
 
 
-def read(data: Dataset, steps: int, seed: int) -> Seen:
+def read(data: Dataset, steps: int, seed: int) -> Transitions:
     """Episodes of a data set, drawn until they have so many steps."""
     chosen, total = list[int](), 0
     lengths = data.episodes["length"].tolist()
@@ -119,5 +119,5 @@ def _columns(
     )
 
 
-def _joined(task: Task, episodes: Iterable[_Columns]) -> Seen:
-    return Seen(task, *map(np.concatenate, zip(*episodes, strict=True)))
+def _joined(task: Task, episodes: Iterable[_Columns]) -> Transitions:
+    return Transitions(task, *map(np.concatenate, zip(*episodes, strict=True)))

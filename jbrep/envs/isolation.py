@@ -1,7 +1,7 @@
-"""What an environment does to its process, it does to itself alone.
+"""Keeps an environment's changes to the process to itself.
 
 An environment may change the working directory, torch's default type, the filters of warnings and
-all else that a process has once. It finds it again as it left it, and jbrep as it was.
+other global state. Each side finds its own again.
 """
 
 import ctypes
@@ -147,12 +147,12 @@ def in_time() -> Iterator[None]:
 
 OURS = (KeyboardInterrupt, StoppedProcess)  # which no environment raises
 _OUTPUT = _ToErrors()
-_theirs: dict[str, Any] = {}  # what environments have changed, as they left it
+_environment_state: dict[str, Any] = {}  # what environments have changed, as they left it
 _inside = False
 
 
 @contextmanager
-def aside(in_episode: bool = False) -> Iterator[None]:
+def isolated(in_episode: bool = False) -> Iterator[None]:
     """Let an environment do what it does: what it changes is put back, what it prints is an error.
 
     Args:
@@ -167,9 +167,9 @@ def aside(in_episode: bool = False) -> Iterator[None]:
         return
     torch = sys.modules.get("torch")  # which may only just be being imported
     every = _globals(in_episode, torch if hasattr(torch, "get_rng_state") else None)
-    ours = {name: each.get() for name, each in every.items()}
-    for name in _theirs.keys() & every.keys():
-        every[name].put(_theirs[name])
+    jbrep_state = {name: each.get() for name, each in every.items()}
+    for name in _environment_state.keys() & every.keys():
+        every[name].put(_environment_state[name])
     _inside = True
     try:
         with redirect_stdout(_OUTPUT):
@@ -183,6 +183,6 @@ def aside(in_episode: bool = False) -> Iterator[None]:
         _open_output()
         for name, each in every.items():
             now = each.get()
-            if name in _theirs or now != ours[name]:
-                _theirs[name] = now
-                each.put(ours[name])
+            if name in _environment_state or now != jbrep_state[name]:
+                _environment_state[name] = now
+                each.put(jbrep_state[name])
