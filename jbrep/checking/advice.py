@@ -50,8 +50,8 @@ def advise(
     `where` is the features file that was written, `data` the folder that was read.
     """
     task, features = seen.task, _found(seen, shapes)
-    own = None if data else _own(task)
-    baseline = task.whole if data else own or _own(task, _bounds(task)) or task.whole
+    default = None if data else _undescribed(task)
+    baseline = task.whole if data else default or _undescribed(task, _bounds(task)) or task.whole
     kinds = [[(e.name, e.kind, e.frame) for e in some] for some in (features, task.whole.features)]
     scales = any(each.kind == "scales" for each in findings)
     use_file = bool(
@@ -71,10 +71,10 @@ def advise(
     view = [f"--hide={name}" for name in hidden] + [f"--history={history}"] * (history > 1)
     if data is None:
         file = [f"--features={where or 'features.toml'}"] * use_file
-        given = [*_given(task, own), *file, *view]
+        given = [*_given(task, default), *file, *view]
         commands = [["rl", *given, "--encoder", system, "--out", "runs/first"]]
         if use_file and not where:
-            commands.insert(0, ["check", *_given(task, own)[1:], "--write", "features.toml"])
+            commands.insert(0, ["check", *_given(task, default)[1:], "--write", "features.toml"])
     else:
         derived = f"{data}-seen" if view else str(data)
         commands = [["data", "derive", str(data), *view, "--out", derived]] if view else []
@@ -96,7 +96,7 @@ def _given(task: Task, own: Task | None) -> list[str]:
     return options + [f"--missing={task.missing}"] * bool(task.missing)
 
 
-def _own(task: Task, bounds: Bounds = ()) -> Task | None:
+def _undescribed(task: Task, bounds: Bounds = ()) -> Task | None:
     """The task as its environment describes itself; None where that can't be a task."""
     with suppress(InputError), warnings.catch_warnings(action="ignore"):
         return describe(task.id, task.arguments, task.max_episode_steps, action_bounds=bounds)

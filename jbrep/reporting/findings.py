@@ -306,18 +306,18 @@ def _runs(tables: Tables) -> list[RunFound]:
     known = {task: shares(values) for task, values in of_task.items()}
     found = []
     for run in tables.raw.record.runs:
-        of_run = returns.get((run.label, run.seed), {})
-        fewest = min(map(len, of_run.values()), default=0)  # the last evaluation may have more
-        own = {} if run.status == FAILED else infos.get((run.label, run.seed), {})
-        of_its_task = known.get(run.label.rsplit("/", 2)[0], {})
+        by_step = returns.get((run.label, run.seed), {})
+        fewest = min(map(len, by_step.values()), default=0)  # the last evaluation may have more
+        numbers = {} if run.status == FAILED else infos.get((run.label, run.seed), {})
+        share_names = known.get(run.label.rsplit("/", 2)[0], {})
         found.append(
             RunFound(
                 **{name: getattr(run, name) for name in ("label", "seed", "status", "reason")},
                 steps=run.steps,
                 minutes=round(run.seconds / 60, 1),
-                curve=[(step, float(np.mean(each[:fewest]))) for step, each in of_run.items()],
-                returns=of_run[max(of_run)] if of_run else [],
-                shares={n: float(np.mean(each)) for n, each in own.items() if n in of_its_task},
+                curve=[(step, float(np.mean(each[:fewest]))) for step, each in by_step.items()],
+                returns=by_step[max(by_step)] if by_step else [],
+                shares={n: float(np.mean(each)) for n, each in numbers.items() if n in share_names},
             )
         )
     return found
@@ -341,10 +341,10 @@ def _in_training(tables: Tables) -> dict[str, dict[str, float]]:
 
 def _diagnosed(tables: Tables, analysis: Analysis) -> Iterator[Diagnosed]:
     """Each registered diagnostic that is known of some representation, with final returns."""
-    families = {}
+    family_of = {}
     for label in tables.raw.record.labels.values():
         name, kind = label.settings.representation, label.encoder.kind
-        families[label.settings.task, name] = name if kind == OWN else kind
+        family_of[label.settings.task, name] = name if kind == OWN else kind
     for group in analysis.groups:
         returns = {
             each.representation: float(each.numbers["final_return_mean"].value)
@@ -355,9 +355,9 @@ def _diagnosed(tables: Tables, analysis: Analysis) -> Iterator[Diagnosed]:
             known = {n: each[name] for n, each in values.items() if each.get(name) is not None}
             if not known:
                 continue
-            kin = [families[group.task, each] for each in known]
+            families = [family_of[group.task, each] for each in known]
             x, y = np.array([*known.values()]), np.array([returns[each] for each in known])
-            found = rank_correlation(scalar.better * x, y, kin, analysis.seed)
+            correlation = rank_correlation(scalar.better * x, y, families, analysis.seed)
             yield Diagnosed(
                 task=group.task,
                 algorithm=group.algorithm,
@@ -367,8 +367,8 @@ def _diagnosed(tables: Tables, analysis: Analysis) -> Iterator[Diagnosed]:
                 representations=[*known],
                 values=x.tolist(),
                 final_returns=y.tolist(),
-                families=kin,
-                correlation=Score(*found.tolist()),
+                families=families,
+                correlation=Score(*correlation.tolist()),
             )
 
 
