@@ -24,7 +24,7 @@ SETTINGS = {
     "td3": {"net_arch": [24], "activation_fn": "leaky_relu", "action_repeat": 3},
     "ppo": {"net_arch": [24, 16], "activation_fn": "tanh", "normalize": True},
     "a2c": {"net_arch": [], "normalize": True},
-    "crossq": {"net_arch": [24, 16], "activation_fn": "elu", "action_repeat": 2},
+    "crossq": {"net_arch": [24, 16], "activation_fn": "elu", "batch_norm_eps": 0.5},
 }
 
 

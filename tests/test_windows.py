@@ -22,6 +22,8 @@ def data():
     made = wide(LENGTHS, features=6)
     rewards = np.random.default_rng(1).normal(size=sum(LENGTHS)).astype(np.float32)
     made.dataset.arrays["reward"] = rewards
+    made.dataset.episodes["final_observation"] = np.random.default_rng(2).normal(size=(10, 6))
+    made.dataset.episodes["terminated"] = np.zeros(10, bool)
     return made
 
 
@@ -49,6 +51,16 @@ def test_windows_lie_within_episodes_and_have_the_data_sets_numbers(data, horizo
         mean = data.rewards(steps).mean(axis=1, dtype=float)
         assert np.ptp(arrays["reward"][steps].mean(axis=1) / mean) < 1e-4  # in another unit
         np.testing.assert_allclose(windows.rewards(numbers, horizon), mean, atol=1e-6)
+
+
+def test_the_last_step_of_an_episode_leads_to_its_final_observation(data):
+    windows, lasts = Windows(data, data.train), np.cumsum(LENGTHS) - 1
+    own = np.isin(lasts, data.train)
+    finals = data.scale(data.dataset.episodes["final_observation"][own])
+    following = windows.steps(windows.numbers)[2]
+    np.testing.assert_allclose(
+        following[np.searchsorted(data.train, lasts[own])], finals, rtol=1e-5
+    )
 
 
 def test_a_horizon_that_no_episode_has_is_refused(data):

@@ -60,8 +60,10 @@ def advise(
     known = task.whole.replace(features=features) if use_file else task.whole
     hidden = [*(task.view.hidden if task.view else ())]
     for each in findings:
-        if each.kind == "world" and not is_symmetric:
-            hidden += [name for name in each.features if name in task.whole.feature_names]
+        is_copied = each.kind == "copy" and not {*hidden}.isdisjoint(each.features)
+        if is_copied or (each.kind == "world" and not is_symmetric):
+            known_names = {*task.whole.feature_names}.difference(hidden)
+            hidden += [name for name in each.features if name in known_names]
     steps = [each.numbers["history"] for each in findings if "history" in each.numbers]
     history = max([*steps, task.view.history if task.view else 1])
     system, why = ("symmetry", "turning and shifting it was tried: nothing else changes")
@@ -151,7 +153,9 @@ def _as_seen(feature: Feature, seen: Transitions, shapes: Shapes, i: int) -> Fea
     if turn and turn[:2] in TURNS[:2] and feature.kind == "scalar":
         low, high = turn.low, turn.low + turn.size
         return feature.replace(kind="angle", unit="rad", low=low, high=high, bounded=True)
-    low, high = (float(f"{end:.3g}") for end in np.quantile(seen.before[:, i], _USUAL))
+    low, high = ends = np.quantile(seen.before[:, i], _USUAL).tolist()
+    if low < high:  # three digits of the range
+        low, high = np.round(ends, 2 - int(np.floor(np.log10(high - low)))).tolist()
     if feature.is_angle or feature.low is not None or feature.high is not None or low >= high:
         return feature
     return feature.replace(low=low, high=high)

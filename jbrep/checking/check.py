@@ -84,7 +84,7 @@ class Check(NamedTuple):
 
     @property
     def spread(self) -> dict[int, float]:
-        """How far random actions drive a feature at most if held, as a multiple of one step's."""
+        """How far random actions drive the median feature if held, as a multiple of one step's."""
         if not self.played:
             return {}
         inputs, far = Relations(self.seen, self.shapes, 0).inputs, dict[int, Any]()
@@ -92,7 +92,7 @@ class Check(NamedTuple):
             far[repeat] = inputs(self.seen.after[self.seen.policy == name])[0].std(axis=0)
         if not (moves := far[1] > 0).any():
             return {}
-        return {n: float(np.max(each[moves] / far[1][moves])) for n, each in far.items()}
+        return {n: float(np.median(each[moves] / far[1][moves])) for n, each in far.items()}
 
     def text(self, width: int | None = None) -> str:
         """It for a terminal."""
@@ -129,11 +129,10 @@ class Check(NamedTuple):
         held = ", ".join(f"{repeat} (x{each:.2g})" for repeat, each in spread.items())
         far = [repeat for repeat, each in spread.items() if each >= 0.9 * max(spread.values())]
         advice = f"; try --set action_repeat={far[0]}" if far and spread[far[0]] > _FAR else ""
-        growth = (
-            f"growth of a feature's spread, at most, by steps that actions are held: {held}{advice}"
-        )
         return {
-            "holding": growth if spread else "random actions of one step each move nothing",
+            "holding": f"growth of features' spread by steps that actions are held: {held}{advice}"
+            if spread
+            else "random actions of one step each move nothing",
             "reproducible": "yes" if self.seen.task.reproducible else "no",
             "speed": f"{rate:,.0f} steps/s here: 1M steps take {duration(1e6 / rate)} of play",
         }
@@ -163,7 +162,7 @@ def _check(
     if relations.is_possible:
         findings += relations.findings(is_turned)
     else:
-        notes.append("too few steps to see what predicts what: take more --steps")
+        notes.append("too few steps, or features that move, to see what predicts what")
     if played and not seen.task.reproducible:
         why = "with the same seed and actions, a fresh and a used instance differ"
         fix = "draw everything from self.np_random, and reset all that an episode changes"

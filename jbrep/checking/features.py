@@ -25,12 +25,8 @@ WORST_FIRST = {  # kinds of findings
     "constant": "constant",
     "random": "not reproducible",
 }
-TURNS = (
-    (-np.pi, 2 * np.pi),
-    (0.0, 2 * np.pi),
-    (-180.0, 360.0),
-    (0.0, 360.0),
-)  # from, by; in rad first
+# from, by; in rad first
+TURNS = ((-np.pi, 2 * np.pi), (0.0, 2 * np.pi), (-180.0, 360.0), (0.0, 360.0))
 _ROOM, _WIDE, _CALM = 0.02, 0.8, 0.3  # shares of a turn: margin at its ends, jumps, other steps
 _FEWEST_JUMPS, _FEWEST_VALUES = 3, 20  # of what has another range
 _FLAT, _ROUNDING = 1e-9, 1e-5  # of a feature's magnitude, of the deviation of a copy
@@ -40,7 +36,9 @@ _UNIT = 1e-3  # error of a quaternion's length
 _SHOWN = 4  # names in a line
 _DEGREES = re.compile(r"(^|[_.\W])(deg|degrees?|°)([_.\W]|$)", re.IGNORECASE)
 _ANGLE = re.compile(
-    r"(^|[_.\W])(yaw|pitch|roll|heading|bearing|angle|theta|tilt)([_.\W\d]|$)", re.IGNORECASE
+    r"(^|[_.\W])(yaw|pitch|roll|heading|bearing|angle|theta|tilt)"
+    r"(?!.*(dot|rate|vel|speed|acc))([_.\W\d]|$)",
+    re.IGNORECASE,
 )
 
 

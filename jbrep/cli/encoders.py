@@ -67,7 +67,7 @@ def evaluate(
         evaluation = api.evaluate(found, whole, out, **options).evaluation
     if as_json:
         _tell_notes(found, sources, evaluation, err=True)
-        return say_json(evaluation.as_json())
+        return say(evaluation.text().rstrip())
     say(evaluation_text(evaluation, terminal_width(), everything) + "\n")
     _tell_notes(found, sources, evaluation)
     return say(f"\n{out / EVALUATION}")

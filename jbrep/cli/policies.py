@@ -82,7 +82,7 @@ def export(
     rate = "" if said["rate"] is None else f", {said['rate']:g} times a second"
     say(f"{out}: {own.size} numbers of {own.name} to {own.action_size}{rate}")
     if with_example:
-        say(f"run it with python {loop} {out}")
+        say(f"run it with {shlex.join(('python', str(loop), str(out)))}")
     modules = [f"--import={module}" for module in modules_of(own)]
     check = ["jbrep", "evaluate-policy", str(out), "--beside", policy, *modules]
     with suppress(InputError):  # where it comes of a log alone
@@ -161,9 +161,8 @@ def evaluate_policy(
     if beside and not failure:
         other = find_player(beside, player.task)
         theirs = other.returns(episodes, *how)
-        largest = max(abs(a - b) for a, b in zip(returns, theirs.tolist(), strict=True))
-        said = f"{other.name}: {interval_of(theirs)}; returns differ by at most {largest:.3g}"
-        tell(said, err=as_json)
+        apart = max(abs(a - b) for a, b in zip(returns, theirs.tolist(), strict=True))
+        tell(f"{other.name}: {interval_of(theirs)}; returns differ by at most {apart:.3g}", as_json)
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
     return bool(failure)

@@ -139,7 +139,9 @@ class Job(NamedTuple):
             preset=MODERN,
             overrides={**usual, **overrides, "normalize": True},
         )
-        of_run["steps"] = of_run["evaluate_every"] = of_run["steps"] or _STEPS[how.method]
+        of_run["steps"] = of_run["evaluate_every"] = (
+            _STEPS[how.method] if of_run["steps"] is None else of_run["steps"]
+        )
         of_run["evaluation_episodes"] = min(_AT_ONCE, of_run["final_episodes"])
         run = Run(task=data.task, learner=learner, encoder=encoder, **of_run)
         found, chosen = run.find_encoder(), learner.hyperparameters

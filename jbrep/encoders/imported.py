@@ -180,7 +180,8 @@ def _exported(module: Any, method: str, size: int) -> Model:
     said = type(module).__name__
     if not isinstance(module, torch.nn.Module):
         raise InputError(f"{said} isn't a torch module, of which an Encoder is made")
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # of parts that it doesn't need
+    for name in ("torch.onnx", "torch._subclasses.fake_tensor"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # of parts that it doesn't need
     with refusing(f"{said} can't be exported"), warnings.catch_warnings(action="ignore"):
         copied = copy.deepcopy(getattr(module, "_orig_mod", module))  # of a compiled one
         copied = copied.cpu().float().eval()

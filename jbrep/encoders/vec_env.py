@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from jbrep.encoders.base import BaseEncoder, Float32, as_encoder
+from jbrep.encoders.base import BaseEncoder, Float32
+from jbrep.encoders.shipped import find
 from jbrep.envs.autoreset import AutoresetEnvironments
 from jbrep.envs.description import describe
 from jbrep.envs.environments import State, check_actions
@@ -82,7 +83,7 @@ class JitterbugVecEnv(VecEnv):
         elif max_episode_steps not in (None, task.max_episode_steps):
             raise InputError(f"{task.name} is described with its time limit: describe it anew")
         self.task = task
-        self._encoder = None if encoder is None else as_encoder(encoder, task)
+        self._encoder = None if encoder is None else find(encoder, task)
         self._robots = AutoresetEnvironments(task, num_envs, num_threads, action_repeat, retries)
         self.envs = self._robots.envs
         observation_space, action_space = agent_spaces(task, self._encoder)

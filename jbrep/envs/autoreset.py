@@ -39,8 +39,7 @@ class AutoresetEnvironments:
 
     Args:
         repeat: steps for which each action is held; fewer where an episode ends before.
-        retries: of failures, each of which ends an episode, truncated. The step that failed leads
-            to where it began, with the reward of the step before.
+        retries: of failures, which truncate episodes; a failed step has the reward before it.
     """
 
     def __init__(

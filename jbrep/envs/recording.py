@@ -15,9 +15,8 @@ from jbrep.envs.task import Array
 _Seen = TypeVar("_Seen", bound=NDArray[Any])
 Actor = Callable[[Array], NDArray[Any]]  # observations (n, d) to actions (n, k), once for each step
 Tick = Callable[[int], object]  # called with the number of steps just made, over all environments
-Read = Callable[
-    [Environments], Mapping[str, Array]
-]  # of the environments as they are, (n, ...) each
+# of the environments as they are, (n, ...) each
+Read = Callable[[Environments], Mapping[str, Array]]
 
 
 class PlayedStep(NamedTuple):

@@ -65,7 +65,6 @@ class DeepMDPObjective(Objective):
     reward keeps it wide. Gradients flow through both codes, so losses of epochs can be compared.
     """
 
-    horizon = 1
     _mean: Tensor
     _deviation: Tensor
 
@@ -151,7 +150,6 @@ class SelfPredictionObjective(Objective):
     initial weights, biases outweigh the rows and half of the units repeat the others.
     """
 
-    horizon = 1
     kept_by = None
 
     def __init__(self, method: SelfPrediction, data: ScaledDataset):

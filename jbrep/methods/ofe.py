@@ -103,8 +103,6 @@ class OFEObjective(Objective):
     z = blocks(x) of a row, then the next row is linear in more blocks of (z, action).
     """
 
-    horizon = 1
-
     def __init__(self, method: OFE, data: ScaledDataset):
         super().__init__()
         self._size = data.size

@@ -183,8 +183,6 @@ class LldVaeObjective(VariationalObjective):
     `transition` times that of the moved code from the next row's.
     """
 
-    horizon = 1
-
     def __init__(self, method: LldVae, data: ScaledDataset):
         super().__init__(method, data)
         self._transition_weight = method.transition

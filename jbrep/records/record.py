@@ -84,6 +84,8 @@ def from_text(text: str, kind: Any, where: str) -> Any:
     match bare(type_of(kind)):
         case inspect.IntType():
             return converted(_whole(text, where), kind, where)
+        case inspect.FloatType() if text.startswith("."):
+            text = f"0{text}"
         case inspect.CollectionType():
             return converted(parts, kind, where, strict=False)
         case inspect.DictType() if all("=" in part for part in parts):

@@ -45,8 +45,7 @@ def _statistics(tables: study.Tables) -> tuple[Analysis | None, list[str]]:
     compared, refused = _without_refused(compared, planned.rules.baseline)
     left_out += alone + refused
     try:
-        references = tables.references
-        analysis = analyse(compared, planned, references=references) if compared else None
+        analysis = analyse(compared, planned, references=tables.references) if compared else None
         return analysis, left_out
     except InputError as error:
         return None, [*left_out, str(error)]

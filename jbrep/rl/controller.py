@@ -31,7 +31,6 @@ SEAL, NOT_SEALED = "sha256", "0" * 64  # of an ONNX file, in whose place zeros s
 EXAMPLE = Path(__file__).parent / "shipped/loop.py"  # a program that runs such a file
 _HIDDEN = "latent_pi.", "mlp_extractor.policy_net.", "mu."  # sequences, numbered from 0
 _LAST = "mu", "action_net"  # single layers after them
-_RENORM_EPSILON = 1e-3  # that CrossQ's batch renormalisation adds to the variance
 
 
 class Acting(NamedTuple):
@@ -225,7 +224,8 @@ def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[La
             layers.append(dense(weight * factor, weight @ shift + tensors["bias"], activation))
             factor, shift = np.ones(len(weight)), np.zeros(len(weight))
         else:  # CrossQ's batch renormalisation
-            deviation = np.sqrt(tensors["ra_var"].astype(np.float64) + _RENORM_EPSILON)
+            epsilon = shape.policy_kwargs.get("batch_norm_eps", 1e-3)
+            deviation = np.sqrt(tensors["ra_var"].astype(np.float64) + epsilon)
             factor = tensors["scale"] / deviation
             shift = tensors["bias"] - tensors["ra_mean"] * factor
     return (*layers[:-1], layers[-1]._replace(activation="linear"))

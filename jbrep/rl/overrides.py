@@ -87,8 +87,8 @@ def overridden(algorithm: str, preset: str, overrides: Mapping[str, Any]) -> Hyp
     if not overrides:
         return base
     try:
-        text = json.dumps(overrides, allow_nan=False, sort_keys=True)
-    except (TypeError, ValueError):
+        text = json.dumps(overrides, allow_nan=False, sort_keys=True, default=lambda v: v.item())
+    except (AttributeError, TypeError, ValueError):
         raise InputError(
             f"settings of {algorithm} have a value that is no finite number, text, list or table"
         ) from None

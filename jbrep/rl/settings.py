@@ -65,8 +65,9 @@ class CloneSettings(Record, frozen=True, kw_only=True):
     ] = 2.5
 
     def check(self) -> None:
-        for name, usual in (("loss", "squared"), ("chunk", 1)):
-            if self.method != BC and (given := getattr(self, name)) != usual:
+        of_cloning = {"loss": "squared", "chunk": 1, "patience": 10}
+        for name, usual in ({"alpha": 2.5} if self.method == BC else of_cloning).items():
+            if (given := getattr(self, name)) != usual:
                 raise InputError(f"{name} is {given}: with {self.method} leave it out")
 
 

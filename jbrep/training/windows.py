@@ -74,8 +74,8 @@ class Windows:
         return self._action.index_select(0, places).view(len(numbers), count, -1)
 
     def steps(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Of each window the first row (n, size), its action (n, k), and the next row (n, size)."""
-        return self.rows(numbers), self.actions(numbers)[:, 0], self.rows(numbers, 1)
+        """Of each window the first row (n, size), its action (n, k), and what follows (n, size)."""
+        return self.rows(numbers), self.actions(numbers)[:, 0], self.after(numbers)[0]
 
     def after(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
         """What follows each window's first row, (n, size), also at the end of its episode.

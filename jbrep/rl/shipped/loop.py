@@ -24,7 +24,9 @@ class Policy:
         said = json.loads(self._model.get_modelmeta().custom_metadata_map["jbrep"])
         features, bounds = said["observation"], said["action"]
         self.names = [each["name"] for each in features]
-        self.period, self._repeat = said["control_period"] or 0.01, said["action_repeat"]
+        self.period, self._repeat = said["control_period"], said["action_repeat"]
+        if not self.period:
+            raise SystemExit("the policy's task has no time step: set `period` here [s]")
         self._chunk = np.zeros((said["chunk"], len(bounds["low"])))  # actions chosen at once
         low, high = (np.array([f[end] for f in features], float) for end in ("low", "high"))
         self._low, self._high = low - FAR * (high - low), high + FAR * (high - low)
