@@ -124,7 +124,7 @@ def _system(task: Task, winds: bool) -> tuple[str, str]:
             return "coordinates", why
     except InputError:
         pass
-    return "full", "no feature is known to jump or wind"
+    return "full", "as features are declared, coordinates change nothing"
 
 
 def _found(seen: Transitions, shapes: Shapes) -> tuple[Feature, ...]:
