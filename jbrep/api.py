@@ -267,7 +267,7 @@ def train_encoders(
         data: a folder from jbrep collect, of which 80 % of the episodes are learned from.
         out: a folder for the encoder files; a training that was stopped goes on from there.
         kind: one of dae, pca, slow, ...; jbrep train-encoder --help lists them with their settings.
-        latent: sizes; empty for a kind that has none.
+        latent: sizes, or one; empty for a kind that has none.
         seeds: encoders of each size, with seeds 0, 1, ...: NAME-s0, NAME-s1, ...
         name: its name in files and tables; by default kind and size, such as dae-8.
         preset: named settings; for dae: authors, its authors' own.
@@ -276,7 +276,8 @@ def train_encoders(
     """
     from jbrep.methods.registry import named_settings, with_preset
 
-    named = named_settings(kind, latent, seeds, name, with_preset(kind, preset, settings))
+    sizes = [latent] if isinstance(latent, int) else latent
+    named = named_settings(kind, sizes, seeds, name, with_preset(kind, preset, settings))
     fitter = _fitter(data, out, device)
     for called, each in named:  # every mistake is reported before the first training
         fitter.plan(kind, name=called, **each)
@@ -347,6 +348,8 @@ def evaluate_policy(
     from jbrep.envs.description import as_task
     from jbrep.play.sources import find_player
 
+    if episodes < 1:
+        raise InputError(f"episodes is {episodes}: it must be at least 1")
     player = find_player(policy, None if task is None else as_task(task))
     return player.returns(episodes, threads, retries)
 
