@@ -342,7 +342,7 @@ def parse_pairs(given: Iterable[str], option: str = "--env") -> dict[str, Any]:
         if not equals or not name.isidentifier() or name in arguments:
             raise InputError(f"{option} {pair} isn't an argument, or repeats one: write NAME=VALUE")
         try:
-            arguments[name] = json.loads(value)
+            arguments[name] = json.loads(f"0{value}" if value.startswith(".") else value)
         except (ValueError, RecursionError):
             arguments[name] = value
     return arguments
