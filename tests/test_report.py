@@ -352,6 +352,7 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
     [
         ("runs.json", lambda text: text[:100], "runs.json is damaged"),
         ("runs.json", lambda text: text.replace('"2.13.0', '"2; touch P #'), "versions"),
+        ("returns.csv", lambda text: text.replace("full,3,1000", "full,3,0"), "episodes"),
         ("returns.csv", lambda text: text + "a,b,c,0,0,0,nan\n", "returns.csv is damaged"),
         ("references.csv", lambda text: text + "x", "references.csv is damaged"),
         ("runs.json", None, "runs.json"),

@@ -174,16 +174,13 @@ def test_a_lost_step_has_the_reward_before_it():
 
 
 def test_rewards_of_ones_own_stay_known(brief, tmp_path, monkeypatch):
-    (tmp_path / "paid.py").write_text(
-        "def reward(observations, actions):\n    return actions[:, 0]\n"
-    )
+    (tmp_path / "paid.py").write_text("def reward(seen, actions):\n    return actions[:, 0]\n")
     monkeypatch.syspath_prepend(tmp_path)
     jbrep("data", "derive", brief, "--reward", "paid:reward", "--out", tmp_path / "own")
     for to, name in (("parquet", "own.parquet"), ("minari", "sets")):
         jbrep("data", "export", tmp_path / "own", "--to", to, "--out", tmp_path / name)
     (stored,) = (tmp_path / "sets").rglob("data")
-    for given in (tmp_path / "own.parquet", stored):
-        out = tmp_path / given.name / "imported" if given is stored else tmp_path / "imported"
+    for out, given in (tmp_path / "a", tmp_path / "own.parquet"), (tmp_path / "b", stored):
         jbrep("data", "import", given, "--out", out)
         assert Dataset(out).manifest.settings.reward.startswith("paid:reward ")
 

@@ -57,10 +57,8 @@ def test_the_last_step_of_an_episode_leads_to_its_final_observation(data):
     windows, lasts = Windows(data, data.train), np.cumsum(LENGTHS) - 1
     own = np.isin(lasts, data.train)
     finals = data.scale(data.dataset.episodes["final_observation"][own])
-    following = windows.steps(windows.numbers)[2]
-    np.testing.assert_allclose(
-        following[np.searchsorted(data.train, lasts[own])], finals, rtol=1e-5
-    )
+    following = windows.steps(windows.numbers)[2][np.searchsorted(data.train, lasts[own])]
+    np.testing.assert_allclose(following, finals, rtol=1e-5)
 
 
 def test_a_horizon_that_no_episode_has_is_refused(data):

@@ -96,10 +96,8 @@ class CloneRecord(Document, frozen=True, kw_only=True):
         kept = f"epoch {self.best_epoch} of {len(self.epochs)} is kept; held-out actions:"
         lines = [kept, Table("", ("", "error", "R²"), rows).text(width)]
         means = (("policy", self.policy), ("data", self.data))
-        returns = "; ".join(f"{name} {mean}" for name, mean in means if mean)
-        return "\n".join(
-            lines + ([wrapped(f"mean return [95 %]: {returns}", width)] if returns else [])
-        )
+        text = "; ".join(f"{name} {mean}" for name, mean in means if mean)
+        return "\n".join(lines + ([wrapped(f"mean return [95 %]: {text}", width)] if text else []))
 
 
 class Job(NamedTuple):

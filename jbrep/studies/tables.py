@@ -104,6 +104,8 @@ class Tables(NamedTuple):
         for run in self.record.runs:
             try:
                 found.append(_curve(self, run, evaluated.get((run.label, run.seed), {})))
+            except DamageError:
+                raise
             except InputError as error:  # such as a policy that was cloned, without a curve
                 refused.append(str(error))
         return found, refused
@@ -261,9 +263,11 @@ def _curve(tables: Tables, run: RunFacts, by_step: Mapping[int, list[float]]) ->
     returns = [by_step[step] for step in steps]
     episodes = min(map(len, returns), default=0)  # the last evaluation may have more
     if any(len(each) > episodes for each in returns[:-1]):
-        raise InputError(f"run {run.label}, seed {run.seed}: evaluations differ in their episodes")
+        raise DamageError(f"run {run.label}, seed {run.seed}: evaluations differ in their episodes")
     means = {policy: float(np.mean(each)) for policy, each in played.items()}
     blind = played.get(best_blind(means) or "", ())
+    environment = [task.id, *task.given_arguments, counted(task.max_episode_steps, "step")]
+    environment += [f"domain {task.domain}"] if task.domain else []
     able = (top,) * shared.final_episodes if isinstance(top, float) else played.get(top, ())
     return RunCurve(
         task=task.name,
@@ -285,12 +289,7 @@ def _curve(tables: Tables, run: RunFacts, by_step: Mapping[int, list[float]]) ->
         top=_mean(able[: shared.final_episodes]),
         top_in_training=_mean(able[:episodes]),
         solved=task.solved_return,
-        environment=", ".join(
-            [
-                *(task.id, *task.given_arguments, counted(task.max_episode_steps, "step")),
-                *([f"domain {task.domain}"] if task.domain else []),
-            ]
-        ),
+        environment=", ".join(environment),
         final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
         encoder_seed=run.encoder_seed,
     )
