@@ -50,11 +50,7 @@ np.memmap({flat!r}, np.float32, mode="r").reshape(-1, 16)[rows]
 def dm_control_file(folder: Path) -> tuple[Any, h5py.File]:
     environment = jitterbug.load(TASK, seed=0)
     file = h5py.File(folder / "loop.h5", "w")
-    for name, width in (
-        ("observation", TASKS[TASK].plain.size),
-        ("action", 1),
-        ("reward", 1),
-    ):
+    for name, width in (("observation", TASKS[TASK].plain.size), ("action", 1), ("reward", 1)):
         file.create_dataset(name, (0, width), "f4", maxshape=(None, width), chunks=(1000, width))
     return environment, file
 

@@ -65,10 +65,7 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
     assert re.search(r"4 runs to go, 0 done; [\d.]+ \w+ on one core, [\d.]+ \w+ with 2 ", told)
     for arguments, message in (
         (("studies/none.toml",), "studies/none.toml"),
-        (
-            ("demo", "--backend", "slurm"),
-            "unknown backend 'slurm': choose one of local, ray",
-        ),
+        (("demo", "--backend", "slurm"), "unknown backend 'slurm': choose one of local, ray"),
         (("README.md",), "README.md is not valid TOML"),
     ):
         refused = jbrep("study", *arguments, "--out", tmp_path / "dry")

@@ -8,11 +8,7 @@ import pytest
 from small import flip_bit, write_again
 
 from jbrep.dataset import DamageError, Dataset, reader
-from jbrep.dataset.manifest import (
-    MANIFEST,
-    find_problems,
-    open_shard,
-)
+from jbrep.dataset.manifest import MANIFEST, find_problems, open_shard
 from jbrep.errors import InputError
 
 

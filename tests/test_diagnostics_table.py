@@ -9,13 +9,7 @@ from jbrep.errors import DamageError, InputError
 from jbrep.evaluation import diagnose
 from jbrep.evaluation.diagnosis import SCALARS
 from jbrep.evaluation.evaluation import _REGISTERED, Scalar, Score, diagnostic
-from jbrep.evaluation.table import (
-    Diagnosed,
-    by_label,
-    diagnostics_text,
-    headline,
-    read_diagnostics,
-)
+from jbrep.evaluation.table import Diagnosed, by_label, diagnostics_text, headline, read_diagnostics
 from jbrep.reporting.evaluation import evaluation_text
 
 ROWS = [

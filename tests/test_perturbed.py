@@ -20,13 +20,7 @@ from jbrep.envs.view import with_view
 from jbrep.play.perturbed import domains_of
 from jbrep.play.sources import find_player
 from jbrep.rl import Run, Session, StoppedError, train
-from jbrep.rl.files import (
-    EPISODES,
-    EVALUATIONS,
-    last_returns,
-    read_evaluations,
-    read_run,
-)
+from jbrep.rl.files import EPISODES, EVALUATIONS, last_returns, read_evaluations, read_run
 
 TASKS = {
     "face_direction": describe("face_direction", {}, 12),

@@ -16,13 +16,7 @@ from jbrep.records.document import read_document
 from jbrep.rl.files import RUN, read_run, runs_below
 from jbrep.rl.policy_file import shipped_file
 from jbrep.studies.config import Data, read_study
-from jbrep.studies.plan import (
-    REGISTRATION,
-    Plan,
-    find_committed,
-    registration_in,
-    seal,
-)
+from jbrep.studies.plan import REGISTRATION, Plan, find_committed, registration_in, seal
 from jbrep.studies.prepare import prepare
 from jbrep.studies.record import RECORD, RunsRecord
 from jbrep.studies.runner import register_study, run_study
@@ -133,9 +127,7 @@ def test_other_policies_and_data_than_were_registered_are_told(collected, tmp_pa
     assert plan.policies == plan.registration.policies
     assert plan.deviations([]) == []
     plan.registration = plan.registration.replace(policies={name: "0" * 64})
-    assert plan.deviations([]) == [
-        f"other policies than were registered collected data: {name}",
-    ]
+    assert plan.deviations([]) == [f"other policies than were registered collected data: {name}"]
     there = Plan(TINIER.replace(data={"": Data(folder=str(collected))}), tmp_path / "there")
     with of_a_commit():
         register_study(there)

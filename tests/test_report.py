@@ -25,14 +25,7 @@ from jbrep.records.tables import write_csv, write_rows
 from jbrep.reporting import make_report, report, write_report
 from jbrep.reporting.figures import study_plots, write
 from jbrep.reporting.findings import Findings
-from jbrep.reporting.report import (
-    FINDINGS,
-    MARKDOWN,
-    PAGE,
-    commands,
-    results_text,
-    summary,
-)
+from jbrep.reporting.report import FINDINGS, MARKDOWN, PAGE, commands, results_text, summary
 from jbrep.reporting.tables import read_tables
 from jbrep.reporting.views import say, settings_tables, verdict_tables
 from jbrep.rl.files import ENCODER, EVALUATIONS, Evaluation, read_run
@@ -41,12 +34,7 @@ from jbrep.studies.config import Study, as_study
 from jbrep.studies.plan import Plan
 from jbrep.studies.record import RECORD, RunsRecord
 from jbrep.studies.runner import register_study
-from jbrep.studies.tables import (
-    REFERENCE_RETURNS,
-    play_references,
-    run_of,
-    write_tables,
-)
+from jbrep.studies.tables import REFERENCE_RETURNS, play_references, run_of, write_tables
 
 FINAL = {"full": 800, "dae-8": 300, "pca-8": 820}
 STUDY = Study(

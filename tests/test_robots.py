@@ -143,10 +143,7 @@ def test_two_instances_of_a_class_are_two_robots():
 
     few, many = (describe(Paid(pay), episode_steps=5) for pay in (1.0, 100.0))
     assert few.id != many.id
-    assert [evaluate_policy("still", task=each, episodes=1)[0] for each in (few, many)] == [
-        5,
-        500,
-    ]
+    assert [evaluate_policy("still", task=each, episodes=1)[0] for each in (few, many)] == [5, 500]
 
 
 # one robot, which fails

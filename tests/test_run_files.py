@@ -34,14 +34,7 @@ from jbrep.rl.history import Scalars
 from jbrep.rl.policy import load_run, load_untrained
 
 TASK = describe("face_direction", episode_steps=100)
-SETTINGS = Run.of(
-    task=TASK,
-    algorithm="a2c",
-    encoder="dae-8",
-    steps=80,
-    preset="paper",
-    **ONE_EACH,
-)
+SETTINGS = Run.of(task=TASK, algorithm="a2c", encoder="dae-8", steps=80, preset="paper", **ONE_EACH)
 
 
 @pytest.fixture(scope="module")

@@ -159,10 +159,7 @@ def resumed(run, folder, stop_at=30):
     [
         ("tqc", {**SMALL, "learning_rate": "linear:0.01", "num_envs": 2, "noise": PINK, **HELD}),
         ("crossq", {**SMALL, "renorm_warmup_steps": 2}),
-        (
-            "ppo",
-            {"n_steps": 10, "batch_size": 20, "num_envs": 2, "normalize": True},
-        ),
+        ("ppo", {"n_steps": 10, "batch_size": 20, "num_envs": 2, "normalize": True}),
     ],
 )
 def test_a_stopped_run_resumes_to_the_same_bytes_whatever_its_settings(

@@ -134,9 +134,6 @@ gymnasium.register("RawPendulum-v0", entry_point=raw_pendulum, max_episode_steps
 gymnasium.register("RawCartPole-v0", entry_point=RawCartPole, max_episode_steps=500)
 gymnasium.register("Balancer-v0", entry_point=Balancer, max_episode_steps=200)
 gymnasium.register(
-    "UnboundedBalancer-v0",
-    entry_point=Balancer,
-    max_episode_steps=200,
-    kwargs={"bounded": False},
+    "UnboundedBalancer-v0", entry_point=Balancer, max_episode_steps=200, kwargs={"bounded": False}
 )
 gymnasium.register("AcroCart-v0", entry_point=AcroCart, max_episode_steps=250)

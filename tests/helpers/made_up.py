@@ -10,15 +10,7 @@ from jbrep.encoders import find, save
 from jbrep.records.tables import write_rows
 from jbrep.reporting.figures.panels import PAPER
 from jbrep.reporting.findings import Findings, RunFound, groups_of
-from jbrep.rl.files import (
-    ENCODER,
-    EVALUATIONS,
-    FAILED,
-    FINISHED,
-    RUN,
-    Evaluation,
-    RunRecord,
-)
+from jbrep.rl.files import ENCODER, EVALUATIONS, FAILED, FINISHED, RUN, Evaluation, RunRecord
 from jbrep.rl.training import packages
 from jbrep.stats.analysis import to_plain
 from jbrep.studies.config import as_study
