@@ -3,7 +3,7 @@
 import numpy as np
 
 from jbrep.envs import Environments, describe
-from jbrep.envs.recording import episode_returns
+from jbrep.envs.recording import outcome
 from jbrep.envs.task import Array
 from jbrep.jitterbug.heuristics import HEURISTICS
 
@@ -22,7 +22,7 @@ def main() -> None:
         cells = []
         for candidate in (policy, uniform):
             low, median, high = np.percentile(
-                episode_returns(Environments(describe(task), EPISODES), candidate), (10, 50, 90)
+                outcome(Environments(describe(task), EPISODES), candidate).returns, (10, 50, 90)
             )
             cells.append(f"{median:.0f} [{low:.0f}, {high:.0f}]")
         print(f"| {task:18} | {cells[0]:16} | {cells[1]:16} |", flush=True)

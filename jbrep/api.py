@@ -375,7 +375,7 @@ def train(
     It sees the full observation, scaled, or an encoder's latent. A checkpoint is written every
     minute, and on Ctrl-C before the command ends (td3 takes seconds to get there). Repeat it to
     resume, to the same result. The last checkpoint stays: with more `steps` training continues, to
-    the result of one run of that length.
+    the result of one run of that length with the warm-up and evaluations of the shorter.
 
     Args:
         task: that it learns.

@@ -6,6 +6,7 @@ import cart
 import numpy as np
 import pytest
 import torch
+from behaviour import untrained
 from small import assert_same_files
 
 from jbrep.envs import describe
@@ -13,7 +14,7 @@ from jbrep.errors import InputError
 from jbrep.records import container
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import BEGINNING, POLICY, POLICY_ZIP, RUN, read_evaluations, read_run
-from jbrep.rl.policy import load_run, load_untrained
+from jbrep.rl.policy import load_run
 
 CART = describe(cart.ID)
 SETTINGS = {
@@ -51,19 +52,19 @@ def returns_at(folder, step):
 
 def test_all_of_the_policy_comes_along(source, later):
     """Actor, critics and their targets; the entropy coefficient starts anew."""
-    there, ours, untrained = (
+    there, ours, first = (
         container.read(folder / name, "policy")[0]
         for folder, name in ((source, POLICY), (later, POLICY), (later, BEGINNING))
     )
     parts = {"policy", "training", "encoder"}
     assert {name.partition(".")[0] for name in there} == parts
     assert {n.split(".")[1] for n in there if n[0] == "t"} == {"critic", "critic_target"}
-    for each in (ours, untrained):
+    for each in (ours, first):
         assert {*each} == {*there}
         assert all(np.array_equal(each[name], there[name]) for name in there)
-    before, after = (weights(load(source)) for load in (load_untrained, load_run))
+    before, after = (weights(load(source)) for load in (untrained, load_run))
     assert any(not before[name].equal(after[name]) for name in before if "actor" in name)
-    assert weights(load_untrained(later))["actor.mu.weight"].equal(after["actor.mu.weight"])
+    assert weights(untrained(later))["actor.mu.weight"].equal(after["actor.mu.weight"])
     assert returns_at(later, 0) == returns_at(source, 1016)
     with (
         zipfile.ZipFile(later / POLICY_ZIP) as file,
@@ -87,7 +88,7 @@ def test_it_is_resumed_to_the_same_bits(source, later, tmp_path):
     run = Run.of(**SETTINGS, seed=1, steps=40, begin_from=str(source))
     with pytest.raises(StoppedError):
         train(run, tmp_path, Session(stop=iter([False] * 5 + [True]).__next__))
-    assert load_untrained(tmp_path).task == CART
+    assert untrained(tmp_path).task == CART
     train(run, tmp_path)
     assert_same_files(tmp_path, later, POLICY, BEGINNING, "evaluations.csv")
 

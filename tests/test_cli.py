@@ -4,22 +4,34 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
+from collections.abc import Mapping, Sequence
+from importlib.metadata import packages_distributions, version
+from itertools import chain
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
 from click.shell_completion import ShellComplete
+from click.testing import CliRunner
 from command import jbrep
+from msgspec import Meta, field
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from stable_baselines3 import A2C
 from test_study import TOML
 
+from jbrep import doctor
 from jbrep.cli import main
+from jbrep.cli.generator import Command
 from jbrep.encoders import find, save
 from jbrep.encoders.shipped import unlearned
 from jbrep.envs import describe
+from jbrep.errors import InputError
 from jbrep.evaluation.table import Diagnosed, diagnostics_text
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.records.record import from_text
+from jbrep.records.record import Record, from_text
 from jbrep.rl.files import read_evaluations
 
 GROUPS = ("data", "encoder", "policy")
@@ -267,3 +279,125 @@ def test_help_of_a_kind_has_its_settings_alone():
     assert "--lags" in told
     assert "--noise" not in told
     assert jbrep("train-dae", "--kind", "pca", "--help").exit_code == 0
+
+
+class Walk(Record, frozen=True, kw_only=True):
+    steps: Annotated[int, Meta(ge=1, le=10_000)]
+    length: Annotated[float, Meta(gt=0)] = 0.5
+    gait: Literal["trot", "pace"] = "trot"
+    start_at: str = field(name="from", default="")
+    legs: tuple[int, ...] = ()
+
+
+def robot(name: str = "bug", mass: Annotated[float, Meta(gt=0)] = 1.0) -> str:
+    return f"{name} of {mass} kg"
+
+
+def walk(
+    out: Path,
+    name: Annotated[str, Meta(extra={"made_by": robot})],
+    *,
+    back: Annotated[bool, Meta(description="And home again.")] = False,
+    lower: Mapping[str, Any] = {},
+    hide: Sequence[str] = (),
+    **walk: Annotated[Any, Walk],
+) -> int:
+    """Walk."""
+    print({"out": out, "name": name, "back": back, "lower": lower, "hide": hide, **walk})
+    return 3
+
+
+def follow(leader: str, /, back: bool, **options: Annotated[Any, walk]) -> None:
+    print(leader, back, options)
+
+
+def run(line, function=walk):
+    command = Command(function.__name__, function, "walk --out x")
+    return CliRunner().invoke(command, line.split(), standalone_mode=False, catch_exceptions=True)
+
+
+def test_parameters_of_functions_and_fields_of_records_are_options():
+    ran = run("--out x --steps 5k --mass 2 --gait pace --from here --legs 1,2 --lower a=1 b=c")
+    assert eval(ran.output, {"PosixPath": Path}) == {
+        **{"out": Path("x"), "name": "bug of 2.0 kg", "back": False, "lower": {"a": 1, "b": "c"}},
+        **{"hide": (), "steps": 5000, "gait": "pace", "start_at": "here", "legs": (1, 2)},
+    }
+    assert ran.exception.code == 3
+
+
+def test_a_function_may_take_the_options_of_another():
+    ran = run("bug --out x --steps 5 --hide a b --back", follow)
+    assert ran.exception is not None  # with an argument, an option takes one value
+    ran = run("bug --out x --steps 5 --hide a --hide b --back", follow)
+    assert ran.output.startswith(
+        "bug True {'out': PosixPath('x'), 'name': 'bug of 1.0 kg', 'hide': ('a', 'b'), "
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ("--steps 0", "steps is 0"),
+        ("--steps 1 --gait fly", "gait is 'fly': it must be one of pace, trot"),
+        ("--steps 1 --mass 0", "mass is '0'"),
+        ("--steps 1 --lower a", "lower a isn't an argument"),
+    ],
+)
+def test_the_annotation_says_what_a_value_must_be(given, told):
+    error = run(f"--out x {given}").exception
+    assert isinstance(error, InputError)
+    assert re.search(re.escape(told), str(error))
+
+
+def test_every_extra_is_examined(monkeypatch):
+    monkeypatch.setattr(doctor, "_opengl", lambda: "not tried")
+    project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
+    assert set(doctor.extras()) == {*project["optional-dependencies"]}
+    text = " ".join(jbrep("doctor").output.split())
+    for name in ("numpy", "mujoco", "torch", "pillow"):
+        assert f"{name} {version(name)}" in text
+
+
+def test_a_module_is_known_by_the_extra_that_brings_it():
+    modules = ("PIL", "sklearn", "rerun", "torch", "ray", "numpy", "fly")
+    extras = ["render", "learn", "view", "learn", "cluster", None, None]
+    assert [doctor.extra_with(module) for module in modules] == extras
+
+
+CORE_ALONE = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path, target=None):
+        if name in missing:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+folder, *missing = sys.argv[1:]
+sys.meta_path.insert(0, Missing())
+from jbrep.cli import main
+for command in ("collect --task face_direction --steps 1000 --out", "data verify", "data info"):
+    try:
+        main([*command.split(), folder])
+    except SystemExit as ended:
+        assert not ended.code, command
+"""
+
+
+def test_without_any_extra_states_are_collected_and_read(tmp_path):
+    project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
+
+    def distributions(requirements):
+        return {canonicalize_name(Requirement(each).name) for each in requirements}
+
+    extras = distributions(chain.from_iterable(project["optional-dependencies"].values()))
+    left_out = extras - distributions(project["dependencies"])
+    modules = [
+        module
+        for module, brought_by in packages_distributions().items()
+        if {*map(canonicalize_name, brought_by)} <= left_out
+    ]
+    assert {"torch", "sklearn", "rosbags"} <= {*modules}
+    command = [sys.executable, "-c", CORE_ALONE, tmp_path / "data", *modules]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "1,000 rows" in done.stdout

@@ -8,15 +8,18 @@ import time
 import numpy as np
 import pytest
 import small
+from command import jbrep
 from kills import COMMAND, kill_and_resume
 from small import contents, settings, write_again, written
 
 from jbrep.collecting import collect, write_shards
+from jbrep.collecting.policies import parse_policy
 from jbrep.collecting.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.manifest import find_problems, open_shard, read_manifest
 from jbrep.dataset.schema import episode_seed
 from jbrep.envs import describe
+from jbrep.envs.names import import_modules
 from jbrep.errors import InputError
 from jbrep.records.storage import exclusive
 
@@ -171,3 +174,50 @@ def test_a_collector_goes_on_only_where_its_shards_are_whole(collected, tmp_path
     (folder / "shard-00003.h5").write_bytes(b"cut")
     with pytest.raises(DamageError, match=r"shard-00003\.h5 is damaged"):
         collect(settings(), folder)
+
+
+import_modules(["environments"])
+OPEN = "uniform:0.4+ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3:0.3+constant:drive=0.5:0.3"
+
+
+def mixed(task="face_direction"):
+    short = describe(task, episode_steps=60)
+    policy = parse_policy(OPEN).settings()
+    return settings(task=short, policy=policy, steps=600, shard_episodes=4)
+
+
+@pytest.fixture(scope="module")
+def mixture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mixture") / "data"
+    collect(mixed(), folder)
+    return folder
+
+
+def test_episodes_say_which_policy_acted_in_them(mixture):
+    dataset = Dataset(mixture)
+    drawn = dataset.episodes["policy"]
+    assert drawn.dtype == np.int32
+    assert set(drawn.tolist()) == {0, 1, 2}
+    assert len(drawn) == 10
+    for number, part in enumerate(drawn):
+        actions = dataset.episode(number)["action"]
+        kind = 2 if (actions == 0.5).all() else int((actions[0] == 0).all())
+        assert kind == part
+    assert jbrep("data", "verify", mixture, "--replay", 2).exit_code == 0
+
+
+def test_neither_environments_nor_threads_change_a_byte_of_a_mixture(mixture, tmp_path):
+    collect(mixed(), tmp_path / "data", num_envs=3, num_threads=2)
+    assert contents(tmp_path / "data") == contents(mixture)
+
+
+def test_in_processes_and_extended(tmp_path):
+    """Of episodes of any length."""
+    policy = parse_policy("uniform:1+constant:drive=-1:1").settings()
+    how = {"task": describe("Sledges/Sledge-v0"), "policy": policy, "store_state": False}
+    for steps, workers in ((60, 1), (61, 2), (150, 1)):
+        some = settings(**how, steps=steps, shard_episodes=5)
+        collect(some, tmp_path / "data", num_threads=workers)
+    collect(some, tmp_path / "at once", num_threads=1)
+    assert contents(tmp_path / "data") == contents(tmp_path / "at once")
+    assert not list(find_problems(tmp_path / "data"))

@@ -1,17 +1,30 @@
 """Reading: columns over shards, splits, scaling, batches, and tools that know nothing of jbrep."""
 
 import json
+import os
+import shutil
 from itertools import accumulate
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from command import jbrep
-from small import brief, write_again
+from small import brief, contents, write_again, written
 
 from jbrep.collecting import collect
+from jbrep.collecting.derive import derive
+from jbrep.collecting.replay import replay_problems
 from jbrep.dataset import Dataset, manifest
 from jbrep.dataset.columns import Column
+from jbrep.dataset.manifest import (
+    MANIFEST,
+    commit,
+    find_problems,
+    open_shard,
+    read_manifest,
+    write_manifest,
+)
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 
@@ -182,3 +195,136 @@ def test_a_shard_is_flat_columns_that_any_hdf5_tool_opens(collected):
 
 def test_a_sample_is_verified():
     assert jbrep("data", "verify", "data/sample/move_to_pose", "--replay", 1).exit_code == 0
+
+
+def test_replayed_episodes_are_equal_bit_for_bit(collected):
+    dataset = Dataset(collected)
+    assert not list(replay_problems(dataset, 5, num_threads=1))
+    assert not list(replay_problems(dataset, 0))
+    with pytest.raises(InputError, match="6 episodes can't be replayed: the data set has 5"):
+        list(replay_problems(dataset, 6))
+
+
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [
+        ("observation", 40),
+        ("action", 10),
+        ("reward", 99),
+        ("qvel", 50),
+        ("episodes/target_position", 0),
+        ("episodes/final_observation", 0),
+    ],
+)
+def test_replay_finds_one_bit_of_difference(name, row, brief, tmp_path):
+    """As another machine's rounding would make it: all hashes hold."""
+    manifest = read_manifest(brief)
+    spoiled = manifest.replace(shards=())
+    for shard in range(2):
+        columns = dict(open_shard(brief, manifest, shard))
+        if shard == 1:
+            values = columns[name].copy()
+            values.reshape(len(values), -1)[row].view(np.uint8)[0] ^= 1
+            columns[name] = values
+        spoiled = commit(tmp_path, spoiled, columns)
+    (problem,) = replay_problems(Dataset(tmp_path), 2)
+    assert "episode 1 simulated again differs" in problem
+
+
+HIDDEN = ["*velocity*"]
+
+
+def test_a_derivation_goes_on_and_leaves_a_finished_one_alone(collected, tmp_path):
+    derive(collected, tmp_path / "whole", HIDDEN)
+    manifest = read_manifest(tmp_path / "whole")
+    folder = tmp_path / "begun"
+    begun = manifest.replace(shards=())
+    folder.mkdir()
+    for shard in range(2):
+        begun = commit(folder, begun, open_shard(tmp_path / "whole", manifest, shard))
+    assert written(folder, lambda: derive(collected, folder, HIDDEN)) == [2, 3, 4]
+    assert contents(folder) == contents(tmp_path / "whole")
+    assert written(folder, lambda: derive(collected, folder, HIDDEN)) == []
+
+
+def test_what_can_t_be_derived(collected, copied, tmp_path):
+    with pytest.raises(InputError, match="other settings"):
+        derive(collected, copied, HIDDEN)
+    manifest = read_manifest(copied)
+    older = {**manifest.versions, "mujoco": "3.16.9"}
+    write_manifest(copied, manifest.replace(versions=older))
+    with pytest.raises(InputError, match="a derived data set needs the same"):
+        derive(copied, tmp_path / "x", HIDDEN)
+    (copied / "shard-00004.h5").unlink()
+    write_manifest(copied, manifest.replace(shards=manifest.shards[:4]))
+    with pytest.raises(InputError, match="is unfinished"):
+        derive(copied, tmp_path / "x", HIDDEN)
+    assert not (tmp_path / "x").exists()
+
+
+def two_by_two(steps, **changes):
+    return brief(steps=steps, shard_episodes=2, **changes)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """A shard of two episodes and one of one."""
+    folder = tmp_path_factory.mktemp("short") / "data"
+    collect(two_by_two(300), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory):
+    """Two shards of two episodes and one of one, collected at once."""
+    folder = tmp_path_factory.mktemp("long") / "data"
+    collect(two_by_two(500), folder)
+    return folder
+
+
+class Kill(BaseException):
+    """As sudden as an exception can be."""
+
+
+def test_a_kill_at_any_moment_leaves_what_is_read_and_extended(short, long, tmp_path, monkeypatch):
+    """Four files are written, each in three stages; full shards are there all the time."""
+    before, left = Dataset(short), 0
+
+    def deadly(call):
+        def wrapped(*arguments, **keywords):
+            nonlocal left
+            left -= 1
+            if left < 0:
+                raise Kill
+            return call(*arguments, **keywords)
+
+        return wrapped
+
+    for stage in range(12):
+        folder, left = shutil.copytree(short, tmp_path / str(stage)), stage
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", deadly(os.fsync))
+            patch.setattr(Path, "replace", deadly(Path.replace))
+            with pytest.raises(Kill):
+                write_again(long, folder)
+        assert not list(find_problems(folder)), stage
+        seen = Dataset(folder)["observation"][:200]
+        np.testing.assert_array_equal(seen, before["observation"][:200])
+        write_again(long, folder)
+        assert contents(folder) == contents(long)
+
+
+def test_what_can_t_be_extended_is_left_as_it_is(short, tmp_path):
+    folder = shutil.copytree(short, tmp_path / "data")
+    with pytest.raises(InputError, match="300 steps"):
+        collect(two_by_two(200), folder)
+    with pytest.raises(InputError, match=r"other settings: steps 300 \(now: 400\), seed 3"):
+        collect(two_by_two(400, seed=4), folder)
+    manifest = read_manifest(folder)
+    changed = manifest.replace(versions={**manifest.versions, "mujoco": "3.0"})
+    write_manifest(folder, changed)
+    with pytest.raises(InputError, match=r"mujoco 3\.0"):
+        collect(two_by_two(400), folder)
+    assert read_manifest(folder) == changed
+    now, before = contents(folder), contents(short)
+    assert [name for name in now if now[name] != before[name]] == [MANIFEST]

@@ -454,7 +454,7 @@ def test_files_that_are_no_data_are_refused(tmp_path, minari_folder):
     shutil.copytree(minari_folder / "cart/push-v0", tmp_path / "spoiled")
     (tmp_path / "spoiled/data/main_data.hdf5").write_bytes(b"nonsense")
     for name, problem in {
-        "a.npz": "can't be read as an npz file",
+        "a.npz": "can't be imported",
         "a.parquet": "can't be read as a Parquet file",
         "a.pkl": "unknown format '.pkl'",
         "names.npz": "names of 1 numbers",

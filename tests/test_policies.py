@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from command import jbrep
 
 from jbrep.collecting.policies import (
     POLICIES,
@@ -15,9 +16,15 @@ from jbrep.collecting.policies import (
     make_policy,
     parse_policy,
 )
+from jbrep.dataset import Dataset
 from jbrep.dataset.schema import episode_part
-from jbrep.envs import Feature, Task, describe
+from jbrep.envs import Environments, Feature, Task, describe
+from jbrep.envs.recording import outcome
 from jbrep.errors import InputError
+from jbrep.jitterbug.heuristics import HEURISTICS
+from jbrep.jitterbug.tasks import TASKS
+from jbrep.play.sources import find_player
+from jbrep.rl.policy_file import FOLDER, SHIPPED, shipped, shipped_file
 
 TASK = describe("face_direction")
 ARM = Task(
@@ -176,3 +183,63 @@ def test_what_chooses_an_episode_s_policy_is_drawn_from_nothing_else():
         others = np.random.default_rng(seed).random(1000)
         beyond = generators(ARM, [seed])[0].random(1000)
         assert ours.isdisjoint([*others, *beyond])
+
+
+LEAST = {
+    "move_from_origin": 950,
+    "face_direction": 930,
+    "move_in_direction": 640,
+    "move_to_position": 850,
+    "move_to_pose": 500,
+}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_median_return_of_four_episodes(task):
+    assert (
+        np.median(outcome(Environments(describe(task), 4), HEURISTICS[task]).returns) >= LEAST[task]
+    )
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_policies_are_functions_of_the_observation_alone(task):
+    observation = np.random.default_rng(0).normal(size=(20, TASKS[task].plain.size))
+    kept = observation.copy()
+    action = HEURISTICS[task](observation)
+    assert action.shape == (20, 1)
+    assert np.abs(action).max() <= 1
+    np.testing.assert_array_equal(observation, kept)
+    for row in (0, 7):
+        one = HEURISTICS[task](observation[row : row + 1])
+        np.testing.assert_allclose(one[0], action[row], rtol=1e-12)
+
+
+SHIPS = shipped()
+
+
+def test_each_file_that_ships_is_listed_with_what_it_returns():
+    assert {policy.task for policy in SHIPS} == {path.stem for path in FOLDER.glob("*.safetensors")}
+    lines = jbrep("policies").output.splitlines()
+    assert [line.split()[0] for line in lines[1 : len(SHIPS) + 1]] == [
+        policy.task for policy in SHIPS
+    ]
+
+
+@pytest.mark.parametrize("policy", SHIPS, ids=lambda policy: policy.task)
+def test_it_returns_what_the_table_says(policy):
+    """Rounding parts long episodes, so that single returns differ between processors."""
+    known = policy.returns[SHIPPED]
+    played = find_player(SHIPPED, describe(policy.task)).returns(2)
+    assert abs(played.mean() - known[:2].mean()) < 2 * known.std() + 20
+
+
+def test_it_collects_and_is_kept_with_the_data(tmp_path):
+    command = ("collect", "--task", "face_direction", "--steps", 300, "--episode-steps", 100)
+    told = jbrep(*command, "--policy", "uniform:0.5+trained:0.5", "--out", tmp_path / "data")
+    assert told.exit_code == 0, told.output
+    (_, _), (_, kept) = Dataset(tmp_path / "data").manifest.settings.policy["parts"]
+    assert kept["run"] == SHIPPED
+    assert (tmp_path / "data" / kept["file"]).read_bytes() == shipped_file(
+        "face_direction"
+    ).read_bytes()
+    assert jbrep("data", "verify", tmp_path / "data", "--replay", 3).exit_code == 0

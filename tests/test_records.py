@@ -1,15 +1,18 @@
-"""Records: each value is checked once, wherever it comes from, and each mistake is one line."""
+"""Records and their container: whatever changes in a file is noticed."""
 
 import json
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
+import numpy as np
 import pytest
 from command import refused
 from msgspec import Meta
+from small import flip_bit
 
 from jbrep.errors import DamageError, InputError
+from jbrep.records import container
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Finite, Record, from_plain, from_text
 from jbrep.records.storage import publish, unfinished, write_new, write_whole
@@ -122,3 +125,27 @@ def test_a_file_is_written_whole_or_stays_as_it_was(tmp_path, monkeypatch):
         write_new(partial / "in" / "it", b"x")
         publish(partial, tmp_path / "folder")
     assert sorted(each.name for each in tmp_path.rglob("*")) == ["folder", "in", "it", "it"]
+
+
+def test_what_is_written_is_read_back_and_each_changed_bit_of_it_noticed(tmp_path):
+    tensors = {
+        "transposed": np.arange(6, dtype=np.float32).reshape(2, 3).T,
+        "scalar": np.zeros(()),
+        "empty": np.zeros((0, 3), np.int64),
+        "flags": np.array([True, False]),
+    }
+    header = {"pair": (1, 2), "nested": {"b": None, "a": 1e-300}}
+    container.write(tmp_path / "it", tensors, header)
+    given, plain = container.read(tmp_path / "it", "thing")
+    assert plain == {"pair": [1, 2], "nested": {"b": None, "a": 1e-300}}
+    for name, tensor in tensors.items():
+        np.testing.assert_array_equal(given[name], tensor)
+        assert given[name].dtype == tensor.dtype
+    container.write(tmp_path / "again", given, plain)
+    whole = (tmp_path / "it").read_bytes()
+    assert (tmp_path / "again").read_bytes() == whole
+    for bit in range(8 * len(whole) - 200, 8 * len(whole)):
+        flip_bit(tmp_path / "it", bit)
+        with pytest.raises(DamageError, match="is damaged"):
+            container.read(tmp_path / "it", "thing")
+        flip_bit(tmp_path / "it", bit)

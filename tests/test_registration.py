@@ -8,10 +8,16 @@ from pathlib import Path
 import pytest
 from command import in_this_process, jbrep
 from made_up import of_a_commit
+from small import contents, settings, write_again
 from test_study import TINY
 
+from jbrep.collecting import collect
+from jbrep.dataset import Dataset
+from jbrep.dataset.manifest import read_manifest, write_manifest
 from jbrep.encoders import find, load, save
+from jbrep.envs import describe
 from jbrep.errors import InputError
+from jbrep.records import commit as of_git
 from jbrep.records.document import read_document
 from jbrep.rl.files import RUN, read_run, runs_below
 from jbrep.rl.policy_file import shipped_file
@@ -40,7 +46,8 @@ def registered(tmp_path_factory):
 def git(folder, *arguments):
     """A command of git, as someone."""
     who = ("-c", "user.name=It", "-c", "user.email=it@it", "-c", "commit.gpgsign=false")
-    subprocess.run(["git", "-C", str(folder), *who, *arguments], check=True, capture_output=True)
+    given = ["git", "-C", str(folder), *who, *arguments]
+    return subprocess.run(given, check=True, capture_output=True, text=True).stdout.strip()
 
 
 @pytest.fixture
@@ -284,3 +291,49 @@ def test_a_study_with_claims_is_registered_when_it_begins(tmp_path):
     assert read_run(run).settings.registration == again.registration.sha256
     (again.folder / REGISTRATION).unlink()
     assert Plan(CLAIMS, again.folder).registration is None
+
+
+HEAD = "0123456789" * 4
+
+
+def test_a_commit_and_whether_files_differ_from_it(tmp_path, monkeypatch):
+    folder = tmp_path / "work" / "deeper"
+    folder.mkdir(parents=True)
+    assert of_git._commit(folder) == ""
+    git(tmp_path, "init", "-q")
+    assert of_git._commit(folder) == ""  # nothing is committed
+    (folder / "file").write_text("one")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-qm", "one")
+    head = git(tmp_path, "rev-parse", "HEAD")
+    (folder / "untracked").write_text("two")
+    assert of_git._commit(folder) == head
+    (folder / "file").write_text("two")
+    assert of_git._commit(folder) == f"{head}+changes"
+    installed = folder / "site-packages"
+    installed.mkdir()
+    assert of_git._commit(installed) == ""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert of_git._commit(folder) == ""  # without git
+
+
+def test_a_manifest_says_the_commit_of_its_start_and_resumes_at_another(collected, tmp_path):
+    assert read_manifest(collected).commits == dict(of_git.commits())
+    folder = tmp_path / "data"
+    manifest = write_again(collected, folder).replace(commits={"jbrep": HEAD})
+    write_manifest(folder, manifest.replace(shards=manifest.shards[:4]))
+    collect(settings(), folder)
+    assert read_manifest(folder) == manifest
+    assert Dataset(folder).fingerprint == Dataset(collected).fingerprint
+    shards = [name for name in contents(folder) if name.endswith(".h5")]
+    assert all(contents(folder)[name] == contents(collected)[name] for name in shards)
+    with pytest.raises(InputError, match="commits"):
+        manifest.replace(commits={"jbrep": "main"})
+
+
+def test_an_encoder_is_the_same_at_another_commit(tmp_path):
+    encoder = find("dae-8", describe("face_direction"))
+    other = encoder.with_header(commits={"work": HEAD})
+    save(other, tmp_path / "it.safetensors")
+    assert load(tmp_path / "it.safetensors").header.commits == {"work": HEAD}
+    assert load(tmp_path / "it.safetensors").fingerprint == encoder.fingerprint

@@ -112,7 +112,7 @@ def test_whoever_plays_the_policy_holds_its_actions(run, tmp_path):
             assert rollout.episode_return == pytest.approx(expected, abs=1e-2)
             assert_held(rollout.action)
     assert read(run / POLICY).header.settings.hyperparameters.action_repeat == REPEAT
-    assert load_run(run).action_repeat == REPEAT
+    assert load_run(run).settings.hyperparameters.action_repeat == REPEAT
     made = settings(task=TASK, steps=100, shard_episodes=1)
     policy = find_policy(str(run), tmp_path / "data", TASK)
     collect(made.replace(policy=policy.settings()), tmp_path / "data", policy=policy)

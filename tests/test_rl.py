@@ -23,10 +23,10 @@ from tensors import torch_threads
 
 from jbrep.encoders import find
 from jbrep.envs import Environments, describe
-from jbrep.envs.recording import Outcome, episode_returns
+from jbrep.envs.recording import Outcome, outcome
 from jbrep.errors import InputError
 from jbrep.rl import Run, Session, StoppedError, train
-from jbrep.rl.agent import evaluate, make_agent, make_env, training_seed
+from jbrep.rl.agent import ColouredActionNoise, evaluate, make_agent, make_env, training_seed
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, POLICY, read_evaluations, read_run
 from jbrep.rl.history import Bar, History
 from jbrep.rl.policy import load_run
@@ -132,7 +132,7 @@ def test_plain_sb3_loads_the_policy_that_was_evaluated(short):
     rows = encoder(np.random.default_rng(0).normal(size=(50, 16)).astype(np.float32))
     expected = plain.predict(rows, deterministic=True)[0]
     np.testing.assert_array_equal(trained.policy.predict(rows, deterministic=True)[0], expected)
-    returns = episode_returns(Environments(TASK, 1), trained.begin(TASK, [0]), EVALUATION_SEED)
+    returns = outcome(Environments(TASK, 1), trained.begin(TASK, [0]), EVALUATION_SEED).returns
     at_end = [e.episode_return for e in read_evaluations(short) if e.step == 80]
     np.testing.assert_allclose(returns, at_end[:1], atol=5e-4)
 
@@ -359,3 +359,39 @@ def test_evaluations_take_a_small_share_of_a_run_with_the_defaults():
     assert episodes * run.task.max_episode_steps <= 0.15 * settings.steps
     short = run.replace(steps=50_000)
     assert short.settings(short.find_encoder()).evaluate_every == 10_000
+
+
+LENGTH = 1000
+
+
+def episodes(beta, sigma, envs):
+    """What environments draw in their first episode, (environments, steps)."""
+    np.random.seed(0)  # noqa: NPY002 - stable-baselines3 draws there
+    each = [ColouredActionNoise(beta, sigma, 1, LENGTH) for _ in range(envs)]
+    return np.array([[float(one()[0]) for _ in range(LENGTH)] for one in each])
+
+
+@pytest.mark.parametrize("beta", [0.5, 2.0])
+def test_coloured_noise_has_its_spectrum_and_spread(beta):
+    drawn = episodes(beta, 0.3, 64)
+    power = (np.abs(np.fft.rfft(drawn)) ** 2).mean(0)
+    frequency = np.fft.rfftfreq(LENGTH)
+    slope, _ = np.polyfit(np.log(frequency[1:-1]), np.log(power[1:-1]), 1)
+    assert slope == pytest.approx(-beta, abs=0.05)
+    assert np.sqrt((drawn**2).mean()) == pytest.approx(0.3, rel=0.2)
+
+
+def test_noise_of_the_next_episode_is_drawn_when_the_last_is_over_or_cut_short():
+    np.random.seed(0)  # noqa: NPY002
+    whole = [ColouredActionNoise(1, 0.2, 2, 4) for _ in range(3)]
+    firsts = [each() for each in whole]
+    np.random.seed(0)  # noqa: NPY002
+    noise = ColouredActionNoise(1, 0.2, 2, 4)
+    first, *_, fifth = [noise() for _ in range(5)]
+    noise.reset()
+    for drawn, expected in zip((first, fifth, noise()), firsts, strict=True):
+        np.testing.assert_array_equal(drawn, expected)
+
+
+def test_an_episode_of_one_step_has_noise():
+    assert np.isfinite(ColouredActionNoise(1, 0.2, 3, 1)()).all()

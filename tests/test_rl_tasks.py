@@ -5,6 +5,7 @@ import re
 import cart
 import numpy as np
 import pytest
+from behaviour import untrained
 from command import jbrep
 from small import ONE_EACH, assert_same_files
 
@@ -28,7 +29,7 @@ from jbrep.rl.files import (
     read_evaluations,
     read_run,
 )
-from jbrep.rl.policy import load_run, load_untrained
+from jbrep.rl.policy import load_run
 from jbrep.rl.presets import ALGORITHMS, get_preset
 
 CART = describe(cart.ID)
@@ -54,7 +55,7 @@ def test_every_algorithm_changes_its_weights(algorithm, tmp_path):
     playing = load_run(tmp_path)
     action = playing.begin(HOPPER, [0])(np.zeros((1, HOPPER.size)))
     assert action.shape == (1, HOPPER.action_size)
-    before, after = load_untrained(tmp_path).policy.state_dict(), playing.policy.state_dict()
+    before, after = untrained(tmp_path).policy.state_dict(), playing.policy.state_dict()
     assert any(not before[name].equal(after[name]) for name in before)
 
 

@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from behaviour import untrained
 
 from jbrep.collecting import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.encoders import find
 from jbrep.envs import Environments, describe
-from jbrep.envs.recording import episode_returns
+from jbrep.envs.recording import outcome
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.tasks import TASKS
@@ -19,7 +20,6 @@ from jbrep.play.rollout import replay
 from jbrep.play.sources import find_episode, find_player
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, read_evaluations
-from jbrep.rl.policy import load_untrained
 
 
 def short(name):
@@ -84,7 +84,7 @@ def test_an_episode_of_a_run_is_played_without_the_others_to_the_same_bits(run, 
 
 def test_a_policy_before_training_is_the_one_that_was_evaluated_first(run):
     first = [e.episode_return for e in read_evaluations(run) if e.step == 0]
-    before = load_untrained(run)
+    before = untrained(run)
     player = Player("before", before.task, before.begin)
     np.testing.assert_allclose(player.returns(2), first, atol=2e-3)
 
@@ -92,7 +92,7 @@ def test_a_policy_before_training_is_the_one_that_was_evaluated_first(run):
 def test_a_named_policy_plays_alone_as_among_others():
     task = describe("move_to_pose", episode_steps=200)
     alone = find_episode("heuristic", 1, task)
-    returns = episode_returns(Environments(task, 2), HEURISTICS["move_to_pose"], EVALUATION_SEED)
+    returns = outcome(Environments(task, 2), HEURISTICS["move_to_pose"], EVALUATION_SEED).returns
     assert alone.episode_return == pytest.approx(returns[1], rel=1e-6)
     np.testing.assert_array_equal(find_player("heuristic", task).returns(2), returns)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from behaviour import untrained
 from command import jbrep, mistake, refused
 from small import ONE_EACH, forge
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -31,7 +32,7 @@ from jbrep.rl.files import (
     read_run,
 )
 from jbrep.rl.history import Scalars
-from jbrep.rl.policy import load_run, load_untrained
+from jbrep.rl.policy import load_run
 
 TASK = describe("face_direction", episode_steps=100)
 SETTINGS = Run.of(task=TASK, algorithm="a2c", encoder="dae-8", steps=80, preset="paper", **ONE_EACH)
@@ -148,7 +149,7 @@ def test_a_run_under_way_plays_its_checkpoint(under_way, trained):
     assert playing.step == 40
     final, first, now = (
         each.policy.state_dict()["action_net.weight"]
-        for each in (load_run(trained), load_untrained(under_way), playing)
+        for each in (load_run(trained), untrained(under_way), playing)
     )
     assert not now.equal(final)
     assert not now.equal(first)

@@ -6,12 +6,13 @@ import tomllib
 import numpy as np
 import pytest
 import torch
+from behaviour import untrained
 from small import assert_same_files
 
 from jbrep.encoders import find
 from jbrep.envs import describe
 from jbrep.envs.environments import Environments
-from jbrep.envs.recording import episode_returns
+from jbrep.envs.recording import outcome
 from jbrep.errors import InputError
 from jbrep.records.document import toml_text
 from jbrep.rl import Run, Session, StoppedError, train
@@ -19,7 +20,7 @@ from jbrep.rl.agent import evaluate, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, read_evaluations
 from jbrep.rl.learner import Learner, read_preset
 from jbrep.rl.overrides import overridden
-from jbrep.rl.policy import load_run, load_untrained
+from jbrep.rl.policy import load_run
 from jbrep.rl.presets import sb3_class
 from jbrep.studies.config import as_study, read_study
 from jbrep.studies.plan import Plan, read_plan
@@ -179,7 +180,7 @@ def check_last_evaluation(folder):
     """The loaded policy plays the run's last evaluation."""
     trained = load_run(folder)
     envs = Environments(TASK, 2)
-    returns = episode_returns(envs, trained.begin(TASK, [0, 1]), EVALUATION_SEED)
+    returns = outcome(envs, trained.begin(TASK, [0, 1]), EVALUATION_SEED).returns
     last = [row.episode_return for row in read_evaluations(folder) if row.step > 0][-2:]
     np.testing.assert_allclose(returns, last, atol=6e-4)
 
@@ -214,7 +215,7 @@ def test_gradient_steps_and_evaluations_use_the_statistics_without_changing_them
 def test_a_run_that_begins_with_another_takes_its_statistics_along(run, tmp_path):
     later = SAC_RUN.replace(seed=1, steps=5, begin_from=str(run))
     train(later, tmp_path / "later")
-    began = load_untrained(tmp_path / "later").statistics
+    began = untrained(tmp_path / "later").statistics
     np.testing.assert_array_equal(began.mean, load_run(run).statistics.mean)
     assert load_run(tmp_path / "later").statistics.count == began.count + 6
     start = [r.episode_return for r in read_evaluations(tmp_path / "later") if r.step == 0]

@@ -15,7 +15,7 @@ from jbrep.cli.generator import parse_pairs
 from jbrep.dataset.schema import episode_seed
 from jbrep.envs import Environments, Feature, Task, describe
 from jbrep.envs.names import import_modules, imported_modules, name_given, spec_of
-from jbrep.envs.recording import episode_returns
+from jbrep.envs.recording import outcome
 from jbrep.envs.task import check_same
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS, get_task
@@ -116,7 +116,7 @@ def test_arguments_reach_the_environment():
         assert task.arguments == arguments
         envs = Environments(task, 2)
         middle = np.tile(np.add(task.action_low, task.action_high) / 2, (2, 1))
-        return episode_returns(envs, lambda observation: middle)
+        return outcome(envs, lambda observation: middle).returns
 
     assert (returns("Pendulum-v1") == returns("Pendulum-v1", g=10.0)).all()
     assert (returns("Pendulum-v1", g=1.6) != returns("Pendulum-v1")).all()

@@ -17,7 +17,7 @@ import cma
 import numpy as np
 
 from jbrep.envs import Environments, describe
-from jbrep.envs.recording import episode_returns
+from jbrep.envs.recording import outcome
 from jbrep.jitterbug.heuristics import HEURISTICS
 
 SEARCH_EPISODES, TEST_EPISODES = 24, 50
@@ -55,7 +55,7 @@ def main() -> None:
 
     def score(factors: np.ndarray, seed: int) -> float:
         candidate = partial(policy, **with_factors(factors))
-        returns = episode_returns(search_envs, candidate, seed)
+        returns = outcome(search_envs, candidate, seed).returns
         return float(np.median(returns) + np.mean(returns)) / 2
 
     size = sum(len(asdict(gait)) for gait in gaits.values())
@@ -69,7 +69,7 @@ def main() -> None:
         search.tell(candidates, [-score(candidate, seed) for candidate in candidates])
         if search.countiter % REPORT_EVERY == 0:
             constants = with_factors(search.mean)
-            test = episode_returns(test_envs, partial(policy, **constants), TEST_SEED)
+            test = outcome(test_envs, partial(policy, **constants), TEST_SEED).returns
             low, median, high = np.percentile(test, (10, 50, 90))
             print(
                 f"generation {search.countiter}: {median:.0f} [{low:.0f}, {high:.0f}] {constants}"

@@ -26,8 +26,10 @@ from jbrep.envs.task import Task
 from jbrep.jitterbug.tasks import jitterbug_task
 from jbrep.play.player import Player
 from jbrep.play.sources import as_player, find_player, is_by_name
-from jbrep.rl.files import FINISHED, is_run, read_run, runs_below
-from jbrep.rl.policy import load_untrained
+from jbrep.rl.checkpoint import read_header
+from jbrep.rl.files import BEGINNING, FINISHED, RUN, is_run, read_run, runs_below
+from jbrep.rl.policy import Trained, build, run_encoder
+from jbrep.rl.policy_file import read
 
 SPEEDS = np.linspace(-180, 180, 73)  # edges of the bins of the motor's velocity [rad/s]
 FAST = 30.0  # of the motor, either way [rad/s]
@@ -59,9 +61,20 @@ def find(sources: Sequence[str], task: Task | None) -> dict[str, list[Player]]:
             runs = [run for run in runs if read_run(run).status == FINISHED]
         after = [find_player(str(run), task) for run in runs]
         before = f"{name}, before training"
-        found[before] = [as_player(before, load_untrained(run), task) for run in runs]
+        found[before] = [as_player(before, untrained(run), task) for run in runs]
         found[f"{name}, {len(runs)} runs" if len(runs) > 1 else name] = after
     return found
+
+
+def untrained(folder: Path) -> Trained:
+    """The policy that a run began with."""
+    known = read_run(folder) if (folder / RUN).exists() else read_header(folder)
+    settings = known.settings
+    built = build(settings, run_encoder(folder, settings), folder)
+    if settings.begin_from is None:
+        return built
+    policy = read(folder / BEGINNING, settings.begin_from)
+    return built.with_weights(policy.weights, policy.tensors, policy.path)
 
 
 def turn_targets(envs: Environments, yaw: float) -> None:

@@ -12,7 +12,6 @@ from jbrep.cli.base import command, say, say_json, tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
 from jbrep.parameters import AsJson, Episodes, NewFile, Retries, TaskName, Threads, described
-from jbrep.records.record import to_plain
 from jbrep.text import counted, interval_of, percentiles, table, terminal_width
 
 if TYPE_CHECKING:
@@ -132,19 +131,12 @@ def evaluate_policy(
     from jbrep.encoders.shipped import source_of
     from jbrep.envs.environments import EnvironmentFailedError
     from jbrep.envs.infos import Numbers
-    from jbrep.play.perturbed import read_perturbation
     from jbrep.play.sources import find_player
-    from jbrep.records.storage import exists, taken
 
-    chosen = [each for each in perturb if each]
-    for each in chosen:
-        read_perturbation(each)
-    if out and not perturb:
-        raise InputError("--out needs --perturb, whose table it is for")
-    if out and exists(out):
-        raise taken(out)
+    chosen = _perturbations(perturb, beside, out)
     player, how = _find(policy, encoder, options), (threads, retries)
     source = None if encoder is None else source_of(encoder, player.task)
+    other = find_player(beside, player.task) if beside else None
     if perturb:
         _perturb(policy, player, chosen, episodes, how, out, as_json)
         return False
@@ -158,14 +150,30 @@ def evaluate_policy(
             raise
         failure = str(error)
     _show_returns(policy, player, source, returns, numbers, as_json)
-    if beside and not failure:
-        other = find_player(beside, player.task)
+    if other and not failure:
         theirs = other.returns(episodes, *how)
         apart = max(abs(a - b) for a, b in zip(returns, theirs.tolist(), strict=True))
         tell(f"{other.name}: {interval_of(theirs)}; returns differ by at most {apart:.3g}", as_json)
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
     return bool(failure)
+
+
+def _perturbations(perturb: Sequence[str], beside: str | None, out: Path | None) -> list[str]:
+    """Those that are named, if the options go together."""
+    from jbrep.play.perturbed import read_perturbation
+    from jbrep.records.storage import exists, taken
+
+    if beside and perturb:
+        raise InputError("--beside compares returns: leave out --perturb")
+    if out and not perturb:
+        raise InputError("--out needs --perturb, whose table it is for")
+    if out and exists(out):
+        raise taken(out)
+    chosen = [each for each in perturb if each]
+    for each in chosen:
+        read_perturbation(each)
+    return chosen
 
 
 def _show_returns(
@@ -231,7 +239,7 @@ def _perturb(
     if out:
         result.write(out)
     if as_json:
-        return say_json(to_plain(result))
+        return say_json(result.as_json())
     tell(f"{_title(policy, player)}, each row the same {counted(episodes, 'episode')}")
     say(f"\n{table(HEADER, [row.cells for row in rows], terminal_width())}")
     return say(f"\n{out}") if out else None

@@ -17,8 +17,9 @@ from jbrep.cloning.td3_bc import TD3BC
 from jbrep.dataset import Dataset
 from jbrep.encoders import Encoder, save
 from jbrep.encoders.base import BaseEncoder
-from jbrep.envs.environments import envs_at_once
-from jbrep.envs.names import environment_versions, spec_of
+from jbrep.envs.environments import EnvironmentFailedError, envs_at_once
+from jbrep.envs.make import is_batched
+from jbrep.envs.names import environment_versions
 from jbrep.envs.recording import Outcome, joined, whole_outcome
 from jbrep.errors import InputError
 from jbrep.machine import cpu
@@ -26,7 +27,17 @@ from jbrep.records.commit import commits
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Finite, to_plain
 from jbrep.records.storage import exclusive, exists, make_folder, write_whole
-from jbrep.rl.files import ENCODER, EVALUATION_SEED, FINISHED, OWN, POLICY, RUN, RunRecord, read_run
+from jbrep.rl.files import (
+    CHECKPOINT,
+    ENCODER,
+    EVALUATION_SEED,
+    FINISHED,
+    OWN,
+    POLICY,
+    RUN,
+    RunRecord,
+    read_run,
+)
 from jbrep.rl.history import History
 from jbrep.rl.learner import Learner, usual_name
 from jbrep.rl.policy import Trained, build, pack_whole
@@ -155,6 +166,8 @@ class Job(NamedTuple):
 def learn(job: Job, folder: Path, threads: int | None = None) -> tuple[RunRecord, CloneRecord]:
     """Learn a policy and write its folder, unless it is complete; what was killed goes on."""
     make_folder(folder, (*OWN, CLONE, _CHECKPOINT))
+    if exists(folder / CHECKPOINT):
+        raise InputError(f"{folder} has a run of jbrep rl: choose another folder")
     with exclusive(folder), single_thread():
         if not exists(folder / RUN):
             _learn(job, folder, threads)
@@ -181,9 +194,18 @@ def _learn(job: Job, folder: Path, threads: int | None) -> None:
     objective.eval()
     parts = _parts(objective, watched, job.data)
     objective.to("cpu")
-    history, played, theirs = History(), None, job.data.episodes.get("return")
-    if not (note := _why_not_played(job.data)):
+    history, played, note, theirs = History(), None, "", job.data.episodes.get("return")
+    try:
         outcome = _play(trained, settings, threads)
+    except (InputError, ModuleNotFoundError) as error:
+        is_log = job.data.manifest.settings.is_imported
+        is_known = not is_log or isinstance(error, EnvironmentFailedError)
+        why = str(error) if is_known else f"{job.data.folder} names no environment"
+        note = (
+            f"the policy wasn't played ({why}): a low error doesn't say what it returns, as errors "
+            "lead to states that aren't in the data, and to larger errors"
+        )
+    else:
         history.add(settings.steps, outcome)
         played = _mean(outcome.returns, trained)
         if job.data.manifest.settings.reward:
@@ -263,25 +285,13 @@ def _parts(objective: Cloning, watched: Windows, data: Dataset) -> dict[str, Any
 
 def _play(trained: Trained, settings: RunSettings, threads: int | None) -> Outcome:
     """What comes of the episodes that every run is evaluated on."""
-    count = settings.final_episodes
-    with envs_at_once(trained.task, settings.evaluation_episodes, threads, 0) as envs:
+    count, most = settings.final_episodes, settings.evaluation_episodes
+    if not is_batched(trained.task):
+        most = min(most, threads or most)
+    with envs_at_once(trained.task, most, threads, 0) as envs:
         seeds = range(EVALUATION_SEED, EVALUATION_SEED + count, envs.num_envs)
         begin = partial(trained.begin, trained.task, ())
         return joined((whole_outcome(envs, begin, seed) for seed in seeds), count)
-
-
-def _why_not_played(data: Dataset) -> str:
-    """Why no policy can be played in the environment of data; empty if one can."""
-    try:
-        spec_of(data.task)
-    except (InputError, ModuleNotFoundError) as error:
-        is_log = data.manifest.settings.is_imported
-        why = f"{data.folder} names no environment" if is_log else str(error)
-        return (
-            f"the policy wasn't played ({why}): a low error doesn't say what it returns, as errors "
-            "lead to states that aren't in the data, and to larger errors"
-        )
-    return ""
 
 
 def _mean(returns: Any, trained: Trained) -> Mean:

@@ -31,7 +31,9 @@ def derive(
     What is hidden, and the history, are as `with_view` takes them; the reward, as `reward_function`
     does, is of what the source shows. An unfinished derivation is resumed.
     """
-    dataset = _finished(source)
+    dataset = Dataset(source)
+    if not dataset.manifest.complete:
+        raise InputError(f"{source} is unfinished: resume it with the same jbrep collect")
     settings = dataset.manifest.settings
     changes = list[Callable[[Columns], Columns]]()
     if reward:
@@ -95,13 +97,6 @@ def _seen(task: Task) -> Callable[[Columns], Columns]:
         return {**columns, "observation": before, final: last}
 
     return change
-
-
-def _finished(source: Path) -> Dataset:
-    dataset = Dataset(source)
-    if not dataset.manifest.complete:
-        raise InputError(f"{source} is unfinished: resume it with the same jbrep collect")
-    return dataset
 
 
 def _check_versions(dataset: Dataset, settings: DataSettings) -> None:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from jbrep.collecting.shards import NUM_ENVS
 from jbrep.dataset import Dataset, DataSettings, Episode
-from jbrep.dataset.manifest import Manifest
 from jbrep.envs.environments import Environments
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Read, Recording, Tick, open_loop, read_nothing, read_states, record
@@ -41,8 +40,11 @@ def replay_problems(
             recording = simulate_again(some, read, bar.update, num_threads)
             for index, episode in enumerate(some):
                 if not _is_equal(recording, index, episode):
-                    what = f"{dataset.folder}: episode {episode.number} simulated again differs"
-                    yield f"{what}: {why_otherwise(dataset.manifest)}"
+                    yield (
+                        f"{dataset.folder}: episode {episode.number} simulated again differs: use "
+                        "the robot as it was, on the machine it was made on, with these versions: "
+                        f"{dict(dataset.manifest.versions)}"
+                    )
 
 
 def why_not_again(settings: DataSettings) -> str:
@@ -53,14 +55,6 @@ def why_not_again(settings: DataSettings) -> str:
     if not settings.task.reproducible:
         return f"{settings.task.name} is not reproducible; collect again in another folder"
     return ""
-
-
-def why_otherwise(manifest: Manifest) -> str:
-    """Why an episode may come out differently."""
-    return (
-        "use the robot as it was, on the machine it was made on, with these versions: "
-        f"{dict(manifest.versions)}"
-    )
 
 
 def simulate_again(

@@ -6,6 +6,7 @@ Quaternions are (w, x, y, z) and turn vectors of the body into the world.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 Columns = list[Any]
@@ -76,20 +77,12 @@ def _upright(library: Any, columns: Columns, soft: float) -> Columns:
     return _quaternion(library, [*columns, nothing + 1, nothing], soft)
 
 
-def _rotate(v: Columns, q: Columns, sign: int) -> Columns:
+def _rotate(sign: int, library: Any, columns: Columns, soft: float) -> Columns:
     """A vector turned by a quaternion, or by its inverse if the sign is -1."""
-    (a, b, c), (w, x, y, z) = v, q
+    a, b, c, w, x, y, z = columns
     w = sign * w
-    p, q1, r = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
-    return [a + 2 * (y * r - z * q1), b + 2 * (z * p - x * r), c + 2 * (x * q1 - y * p)]
-
-
-def _into_body(library: Any, columns: Columns, soft: float) -> Columns:
-    return _rotate(columns[:3], columns[3:], -1)
-
-
-def _into_world(library: Any, columns: Columns, soft: float) -> Columns:
-    return _rotate(columns[:3], columns[3:], 1)
+    p, q, r = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
+    return [a + 2 * (y * r - z * q), b + 2 * (z * p - x * r), c + 2 * (x * q - y * p)]
 
 
 def _turned(library: Any, columns: Columns, soft: float) -> Columns:
@@ -143,7 +136,7 @@ FORMULAS: dict[str, Formula] = {
     "tilt": Formula(4, _UP, _tilt, 4, _upright),
     "heading": Formula(4, _TURN, _heading),
     "attitude": Formula(4, (*_UP, *_TURN), _attitude, 4, _quaternion),
-    "body": Formula(7, _AXES, _into_body, 3, _into_world),
+    "body": Formula(7, _AXES, partial(_rotate, -1), 3, partial(_rotate, 1)),
     "turned": Formula(4, _TURN, _turned, 2, _turned_back),
     "polar": Formula(2, ("length", *_TURN), _polar, 2, _planar),
     "difference": Formula(4, _PLANE, _difference, 2, _sum),

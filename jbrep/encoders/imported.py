@@ -52,7 +52,7 @@ class Model:
 
     def __call__(self, values: Any) -> Any:
         if is_torch(values):
-            return values.new_tensor(self(values.cpu().numpy()))
+            return values.new_tensor(self(values.detach().cpu().numpy()))
         if not isinstance(values, np.ndarray):  # rows of a model that it becomes part of
             return values.through(self.proto, self.units)
         rows = values.reshape(-1, self.inputs).astype(self._dtype)

@@ -112,10 +112,6 @@ def _layer_norm(values: Any) -> Any:
     return (centred / np.sqrt(variance + EPSILON)).astype(values.dtype)
 
 
-def _avg_l1_norm(values: Any) -> Any:
-    return values / np.abs(values).mean(-1, keepdims=True).clip(min=LEAST_NORM)
-
-
 ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {  # for NumPy arrays
     "linear": lambda values: values,
     "relu": lambda values: values.clip(min=0),
@@ -129,7 +125,7 @@ ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {  # for NumPy arrays
     "softplus": lambda values: np.logaddexp(values, 0),
     "sin": np.sin,
     LAYER_NORM: _layer_norm,
-    AVG_L1_NORM: _avg_l1_norm,
+    AVG_L1_NORM: lambda values: values / np.abs(values).mean(-1, keepdims=True).clip(LEAST_NORM),
 }
 
 

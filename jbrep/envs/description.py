@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 from msgspec.structs import asdict
 
 from jbrep.envs.domain import PHYSICS, SIGNALS, Domain, read_ranges
@@ -157,14 +158,17 @@ def with_features(task: Task, said: Path | str | Mapping[str, Any]) -> Task:
         features, offsets = list(task.features), {}
         for i, row in enumerate(rows or ()):
             own = _said(row)
-            offset = own.pop("offset", 0.0)
+            known = (task.offsets or {}).get(features[i].name, 0.0)
+            offset = own.pop("offset", known)
             ends = {name: getattr(features[i], name) for name in ("low", "high")}
-            left = {name: end - offset for name, end in ends.items() if end is not None}
+            left = {name: end + known - offset for name, end in ends.items() if end is not None}
             features[i] = features[i].replace(**left | own)
             if offset:
                 offsets[features[i].name] = offset
         declared = {**_said(changes), "features": features}
-        return task.replace(**declared, **({"offsets": offsets} if offsets else {}))
+        if rows:
+            declared["offsets"] = offsets or UNSET
+        return task.replace(**declared)
     except InputError as error:
         where = "features" if isinstance(said, Mapping) else said
         raise InputError(f"{where} can't be used for {task.name}: {error}") from None

@@ -37,7 +37,6 @@ class Disturbed:
         self._low = np.array([f.low for f in whole.features if f.is_full_turn])
         self._rest, delays = whole.rest, (task.domain.delay[1], task.domain.action_delay[1])
         self._drawn: dict[str, Array] = {n: np.zeros(num_envs) for n in Drawn._fields}
-        self._given = np.zeros((num_envs, whole.size))
         self._measured = np.zeros((num_envs, delays[0] + 1, whole.size))  # the latest first
         self._commands = np.zeros((num_envs, delays[1] + 1, whole.action_size))
         self._shown = np.zeros((num_envs, whole.size))
@@ -52,7 +51,6 @@ class Disturbed:
         self._draw(indices, seeds)
         drawn = {name: self._drawn[name] for name in self._options} if self._push else {}
         given, info = self._batch.reset(seed=seed, options={**options, **drawn})
-        self._given = given
         self._measured[indices] = self._measure(given)[indices, None]
         self._shown[indices] = self._measured[indices, 0]
         self._commands[indices] = self._rest
@@ -75,7 +73,6 @@ class Disturbed:
         _put_first(self._measured, self._measure(given))
         late = self._late(self._measured, "delay")
         self._shown = np.where(arrived[:, None], late, self._shown)
-        self._given = given
         return self._shown.copy(), *others
 
     def _measure(self, given: Array) -> Array:

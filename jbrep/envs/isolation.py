@@ -61,15 +61,6 @@ _GENERATOR: Any = np.random.mtrand._rand._bit_generator  # NumPy's global one
 _STATE_BYTES = 2500  # of MT19937: 624 words, and the place among them
 
 
-def _numpy_state() -> bytes:
-    """Cheaply read: NumPy makes a dictionary of it."""
-    return ctypes.string_at(_GENERATOR.ctypes.state_address, _STATE_BYTES)
-
-
-def _put_numpy_state(state: bytes) -> None:
-    ctypes.memmove(_GENERATOR.ctypes.state_address, state, _STATE_BYTES)
-
-
 _SLOW = {
     "variables": _Global(lambda: dict(os.environb), _put_variables),
     "what Ctrl-C does": _Global(lambda: signal.getsignal(signal.SIGINT), _put_interrupt),
@@ -78,7 +69,10 @@ _QUICK = {
     "the working directory": _Global(_directory, _put_directory),
     "filters of warnings": _Global(lambda: [*warnings.filters], _put_filters),
     "NumPy's errors": _Global(np.geterr, lambda how: np.seterr(**how)),
-    "NumPy's generator": _Global(_numpy_state, _put_numpy_state),
+    "NumPy's generator": _Global(  # cheaply: NumPy makes a dictionary of it
+        lambda: ctypes.string_at(_GENERATOR.ctypes.state_address, _STATE_BYTES),
+        lambda state: ctypes.memmove(_GENERATOR.ctypes.state_address, state, _STATE_BYTES),
+    ),
     "the limit of recursion": _Global(sys.getrecursionlimit, sys.setrecursionlimit),
 }
 

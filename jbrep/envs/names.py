@@ -27,6 +27,7 @@ from jbrep.errors import InputError, kind_and_line, refusing
 from jbrep.records.storage import read_file
 
 _CODE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", re.ASCII)
+_RANDOM_ID = re.compile(rb"[0-9a-f]{32}")  # that cloudpickle gives a class of a script
 _INSTALLED = (  # packages, whose versions stand for their code
     *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")),
     Path(__file__).resolve().parents[1],
@@ -260,7 +261,7 @@ def digest_of(thing: Any) -> str:
         content = b"".join(each.numpy(force=True).tobytes() for each in thing.state_dict().values())
     else:
         with refusing("the policy can't be told from others: give it as module:function"):
-            content = cloudpickle.dumps(thing)
+            content = _RANDOM_ID.sub(b"", cloudpickle.dumps(thing))
     return _short(content + json.dumps(sorted(code_of(thing).items())).encode())
 
 

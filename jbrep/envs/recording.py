@@ -147,11 +147,6 @@ def outcome(
     return Outcome(total, envs.numbers)
 
 
-def episode_returns(envs: Environments, act: Actor, first_seed: int = 0) -> Array:
-    """The returns of `outcome`, (n,)."""
-    return outcome(envs, act, first_seed).returns
-
-
 def whole_outcome(
     envs: Environments, begin: Callable[[], Actor], first_seed: int, tick: Tick = lambda steps: None
 ) -> Outcome:

@@ -14,6 +14,7 @@ from jbrep.dataset.settings import IMPORTED
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.header import EncoderHeader
+from jbrep.encoders.shipped import UNLEARNED
 from jbrep.errors import InputError
 from jbrep.evaluation import control, readout
 from jbrep.evaluation.control import GoodPolicy, Needs, lost, needs
@@ -178,6 +179,8 @@ def _check_finite(label: str, encoder: BaseEncoder, data: ScaledDataset) -> None
 def seen(encoder: BaseEncoder, data: ScaledDataset) -> Literal["no test row", "none", "maybe"]:
     """Which of these rows an encoder saw in training."""
     source = encoder.header.data if isinstance(encoder, Encoder) else {}
+    if not source and encoder.kind in UNLEARNED:
+        return "none"
     manifest = data.dataset.manifest
     if source.get("fingerprint") == data.dataset.fingerprint:
         return "no test row"

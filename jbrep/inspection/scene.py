@@ -10,7 +10,7 @@ from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array, Task
 from jbrep.inspection.recording import SKY, Recording, pieces
 from jbrep.inspection.robot import Robot
-from jbrep.jitterbug.tasks import MOTOR_QPOS, POSITION, QPOS_SIZE, QUATERNION
+from jbrep.jitterbug.tasks import MOTOR_QPOS, POSITION, QPOS_SIZE, QUATERNION, jitterbug_task
 
 WORLD = "world"
 ROBOT = f"{WORLD}/robot"
@@ -42,7 +42,9 @@ def send_scene(
 
 def as_qpos(task: Task, observation: Array) -> Array:
     """Positions (n, 16) from observations (n, d); the legs, which they lack, are at rest."""
-    parts = task.split(observation)
+    own = jitterbug_task(task)
+    assert own
+    parts = own.plain.split(observation)  # a file of features may group them otherwise
     given = parts["orientation"].any(axis=1, keepdims=True)
     turned = np.where(given, parts["orientation"], (1.0, 0.0, 0.0, 0.0))
     qpos = np.zeros((len(observation), QPOS_SIZE))

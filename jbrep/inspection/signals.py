@@ -96,9 +96,9 @@ def send_encoding(
 ) -> None:
     """Send the latent (n, l), and decoded features (n, d), if any, with errors in scaled units."""
     if decoded is not None:
-        task, path = rollout.task, "reconstruction"
+        task, name = rollout.task, "reconstruction"
         titles = [str(f).replace(f.name, f"{f.name} decoded", 1) for f in task.features]
-        send_features(recording, path, times, task, decoded, titles, width=1.0)
+        send_features(recording, name, times, task, decoded, titles, width=1.0)
         true = rollout.observation.astype(np.float64)
         errors = encoder.scale(encoder.comparable(decoded, true)) - encoder.scale(true)
         single, titles = errors.astype(np.float32), scaled_titles(task)
@@ -108,7 +108,10 @@ def send_encoding(
     names = [f"unit {i}" for i in range(encoder.latent_size)]
     for name, place in numbered_panels("units", encoder.latent_size).items():
         recording.send_series(f"latent/{name}", times, latent[:, place], names[place])
-    _send_path(recording, times, latent.astype(np.float64))
+    path = principal_components(latent.astype(np.float64))
+    recording.send(f"{PATH}/all", rr.Points2D(path, colors=[_ALL_COLOUR], radii=[_ALL_RADIUS]))
+    recording.send_moving(PATH, times, rr.LineStrips2D, SKY, _PATH_RADIUS, strips=pieces(path))
+    recording.send_moving(f"{PATH}/now", times, rr.Points2D, YELLOW, _NOW_RADIUS, positions=path)
 
 
 def principal_components(latent: Array) -> Array:
@@ -120,10 +123,3 @@ def principal_components(latent: Array) -> Array:
     largest = two[[0, 1], np.abs(two).argmax(axis=1)]
     signs = np.where(largest < 0, -1, 1)  # the SVD's are arbitrary
     return centred @ (two * signs[:, None]).T
-
-
-def _send_path(recording: Recording, times: Sequence[rr.TimeColumn], latent: Array) -> None:
-    path = principal_components(latent)
-    recording.send(f"{PATH}/all", rr.Points2D(path, colors=[_ALL_COLOUR], radii=[_ALL_RADIUS]))
-    recording.send_moving(PATH, times, rr.LineStrips2D, SKY, _PATH_RADIUS, strips=pieces(path))
-    recording.send_moving(f"{PATH}/now", times, rr.Points2D, YELLOW, _NOW_RADIUS, positions=path)

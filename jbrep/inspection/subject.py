@@ -75,12 +75,6 @@ def inspect(
     return out
 
 
-def _is_other_folder(path: Path) -> bool:
-    """Whether this is a folder, but no data set and no run."""
-    is_folder = exists(path) and path.is_dir()
-    return is_folder and not exists(path / MANIFEST) and not is_run(path)
-
-
 def _find(
     source: str | None, episode: int, task: Task | None, encoder: Any
 ) -> tuple[Rollout, BaseEncoder | None]:
@@ -90,8 +84,9 @@ def _find(
         shown = find_alone(encoder if source is None else source, task)
         shown.check_task(task or shown.task)
         return find_episode(_POLICY, episode, task or shown.task), shown
-    if _is_other_folder(Path(source)):
-        check_begun(Path(source))
+    path = Path(source)
+    if exists(path) and path.is_dir() and not exists(path / MANIFEST) and not is_run(path):
+        check_begun(path)
         raise InputError(
             f"{source} is no data set, and no run with a policy or checkpoint: give the folder of "
             "one; jbrep report shows the curves of several runs"

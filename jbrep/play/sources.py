@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _HEURISTIC = "heuristic"  # the Jitterbug's scripted policy
 _GOOD_EPISODES = 30  # of a good policy
+_OWN_ENCODER = "{} has its own encoder: leave out the encoder"
 
 
 def find_episode(
@@ -129,6 +130,8 @@ def find_player(source: Any, task: Task | None = None, encoder: Any = None) -> P
     if exists(Path(source) / MANIFEST):
         raise InputError(f"{source} is a data set: give the folder of a run or a policy")
     if is_exported(source):
+        if encoder is not None:
+            raise InputError(_OWN_ENCODER.format(source))
         return _exported(Path(source), task)
     check_source(source)
     return Player(source, _needed(task, source), parse_policy(source).begin)
@@ -183,7 +186,7 @@ def _trained(source: str, task: Task | None, encoder: Any) -> Player:
 
     folder = run_folder(source)
     if encoder is not None and folder is None:
-        raise InputError(f"{source} has its own encoder: leave out the encoder")
+        raise InputError(_OWN_ENCODER.format(source))
     trained = load_run(folder, encoder) if folder else of_file(read(policy_file(source, task)))
     name = str(folder or source)
     _check_task(name, trained.task, task)
@@ -254,10 +257,7 @@ def _exported(path: Path, task: Task | None) -> Player:
     session, said = read_exported(path)
     known = task or said.environment
     check_same(known, said.environment, str(path))
-    ends = session.get_inputs(), session.get_outputs()
-    if any(len(end) != 1 or len(end[0].shape) != 2 for end in ends):
-        raise InputError(f"{path} isn't a policy that jbrep policy export wrote")
-    (given,), (made,) = ends
+    (given,), (made,) = session.get_inputs(), session.get_outputs()
     sizes = given.shape[1], made.shape[1]
     if sizes != (known.size, said.chunk * known.action_size):
         raise InputError(

@@ -11,7 +11,7 @@ https://jcristharif.com/msgspec/constraints.html
 
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
 from itertools import chain
 from typing import Annotated, Any, Self, TypeVar
@@ -39,6 +39,7 @@ Version = Annotated[str, pattern(r"(?a)\A\w[\w.+!-]*\Z", "a version")]  # or the
 Sha256 = Annotated[str, pattern(r"\A[0-9a-f]{64}\Z", "a SHA-256: 64 hexadecimal digits")]
 
 _FIELD = re.compile(r"Object (missing required|contains unknown) field `(.*)`")
+_FRACTION = re.compile(r"\A([+-]?)(\.[0-9]+(?:e[+-]?[0-9]+)?)\Z")  # of a number without its 0
 _STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]")
 _WITH_PARTS = (
     *(inspect.StructType, inspect.NamedTupleType, inspect.DictType),
@@ -84,8 +85,6 @@ def from_text(text: str, kind: Any, where: str) -> Any:
     match bare(type_of(kind)):
         case inspect.IntType():
             return converted(_whole(text, where), kind, where)
-        case inspect.FloatType() if text.startswith("."):
-            text = f"0{text}"
         case inspect.CollectionType():
             return converted(parts, kind, where, strict=False)
         case inspect.DictType() if all("=" in part for part in parts):
@@ -111,11 +110,20 @@ def _whole(text: str, where: str) -> int:
 def converted(value: Any, kind: Any, where: str, strict: bool = True) -> Any:
     """As `from_plain`, for types that aren't classes; not strict of numbers that are text."""
     try:
-        return msgspec.convert(value, kind, strict=strict)
+        return msgspec.convert(value if strict else _with_zeros(value), kind, strict=strict)
     except msgspec.ValidationError as error:
         raise InputError(_line(str(error), value, kind, where)) from None
     except RecursionError:
         raise InputError(f"{where or 'it'} must be nested less deeply") from None
+
+
+def _with_zeros(value: Any) -> Any:
+    """Numbers such as -.5 in text, lists and tables as -0.5, which msgspec takes."""
+    if isinstance(value, str):
+        return _FRACTION.sub(r"\g<1>0\2", value)
+    if isinstance(value, Mapping):
+        return {name: _with_zeros(each) for name, each in value.items()}
+    return [*map(_with_zeros, value)] if isinstance(value, list | tuple) else value
 
 
 def _line(message: str, value: Any, kind: Any, where: str) -> str:

@@ -98,12 +98,6 @@ def read_header(folder: Path) -> Header | None:
     return document_from(container.peek(path), path, Header) if exists(path) else None
 
 
-def run_settings(folder: Path) -> RunSettings:
-    """The settings of a run that has ended or has a checkpoint."""
-    header = None if exists(folder / RUN) else read_header(folder)
-    return header.settings if header else read_run(folder).settings
-
-
 class Standing(NamedTuple):
     """How far a run has come in its folder."""
 

@@ -5,6 +5,7 @@ Any runtime of ONNX computes actions with such a file.
 
 import hashlib
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,8 +37,8 @@ _LAST = "mu", "action_net"  # single layers after them
 class Acting(NamedTuple):
     """What a policy computes with, written once for NumPy and ONNX."""
 
-    # mean (l,) and standard deviation (l,) of what the network sees, if it is normalised by them
-    statistics: tuple[Any, Any] | None
+    # of what the network sees, if it is normalised by them: `Statistics.arrays`
+    statistics: tuple[Any, ...] | None
     # layers to the actions before they are squashed or clipped to [-1, 1]
     network: tuple[Layer, ...]
     # low, high: bounds of the actions, (k,), to which they are scaled then; of each of a chunk
@@ -48,8 +49,8 @@ class Acting(NamedTuple):
     def actions(self, seen: Any) -> Any:
         """Actions (..., k) of latents (..., l): arrays, or rows of a model."""
         if self.statistics:
-            mean, deviation = self.statistics
-            seen = ((seen - mean) / deviation).clip(-CLIP, CLIP)
+            mean, rest, deviation = self.statistics
+            seen = ((seen - mean - rest) / deviation).clip(-CLIP, CLIP)
         chosen = run(self.network, seen)
         if self.is_squashed:
             chosen = activate("tanh", chosen)
@@ -146,26 +147,30 @@ class Controller:
             )
         if self._given is not None:
             rows = np.where(lacking, np.atleast_2d(self._given), rows)
-        seen = self._with_history(rows, left_out).reshape(*given.shape[:-1], -1)
+        window, seen = self._with_history(rows, left_out)
+        seen = seen.reshape(*given.shape[:-1], -1)
         choice, part = divmod((now - first) // self.action_repeat, self.settings.chunk)
         if begins or choice != self._choice:
             self._chunk = self._chosen(seen)
         self._held = np.split(self._chunk, self.settings.chunk, axis=-1)[part]
-        self._given, self._missed = rows.reshape(given.shape), missed
+        self._given, self._missed, self._window = rows.reshape(given.shape), missed, window
         self._first, self._step, self._choice = first, now, choice
         return self._held.reshape(*given.shape[:-1], -1).copy()
 
-    def _with_history(self, rows: NDArray[np.float32], left_out: int) -> NDArray[np.float32]:
+    def _with_history(
+        self, rows: NDArray[np.float32], left_out: int
+    ) -> tuple[Window | None, NDArray[np.float32]]:
         if not self.task.view:
-            return rows
+            return None, rows
         if self._window is None or self._given is None:
-            self._window = Window(self.task, len(rows), range(len(self._names)))
-            seen = self._window.begin(range(len(rows)), rows)
+            window = Window(self.task, len(rows), range(len(self._names)))
+            seen = window.begin(range(len(rows)), rows)
         else:
             before, moved = np.atleast_2d(self._given), np.ones(len(rows), np.bool_)
+            window = deepcopy(self._window)
             for given in (*[before] * left_out, rows):
-                seen = self._window.step(moved, np.atleast_2d(self._held), given)
-        return seen.astype(np.float32)
+                seen = window.step(moved, np.atleast_2d(self._held), given)
+        return window, seen.astype(np.float32)
 
     def _numbers(self, observation: ArrayLike | None) -> NDArray[np.float32]:
         """An observation's numbers of now, (d,) or (n, d)."""
@@ -331,7 +336,7 @@ def described(controller: Controller) -> dict[str, Any]:
 
 
 def _numbers(observation: Any) -> NDArray[np.float32]:
-    """An observation's numbers; a masked one is a reading that is missing."""
+    """An observation's numbers, none of them masked."""
     given: NDArray[Any] = np.ma.asanyarray(observation)
     if given.dtype.kind not in "fiub" or np.ma.is_masked(given) or not given.size:
         raise TypeError

@@ -58,10 +58,10 @@ class Statistics:
         return {_PREFIX + name: np.asarray(getattr(self, name)) for name in _KEPT}
 
     @property
-    def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Mean and standard deviation (size,), as an agent's input is normalised by them."""
-        deviation = np.sqrt(self.variance + _EPSILON)
-        return self.mean.astype(np.float32), deviation.astype(np.float32)
+    def arrays(self) -> tuple[NDArray[np.float32], ...]:
+        """Mean, what float32 rounds off of it, and standard deviation, (size,) each."""
+        mean, deviation = self.mean.astype(np.float32), np.sqrt(self.variance + _EPSILON)
+        return mean, (self.mean - mean).astype(np.float32), deviation.astype(np.float32)
 
     def __call__(self, seen: NDArray[np.float32]) -> NDArray[np.float32]:
         """What an agent sees, (n, size), normalised as in training."""

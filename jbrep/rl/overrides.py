@@ -60,7 +60,10 @@ _REFUSED = {  # arguments that are jbrep's own, with the reason
         ("optimizer_class", "use_rms_prop", "rms_prop_eps"), "the optimiser is always Adam"
     ),
     **dict.fromkeys(
-        ("normalize_images", "features_extractor_class", "features_extractor_kwargs"),
+        (
+            *("normalize_images", "share_features_extractor"),
+            *("features_extractor_class", "features_extractor_kwargs"),
+        ),
         "observations are flat already",
     ),
     **dict.fromkeys(
@@ -71,7 +74,11 @@ _REFUSED = {  # arguments that are jbrep's own, with the reason
         "a checkpoint needs the usual buffer",
     ),
     **dict.fromkeys(
-        ("use_sde", "sde_sample_freq", "use_sde_at_warmup"), "a checkpoint has no noise on features"
+        (
+            *("use_sde", "sde_sample_freq", "use_sde_at_warmup"),
+            *("use_expln", "full_std", "clip_mean"),
+        ),
+        _NO_SDE := "a checkpoint has no noise on features",
     ),
 }
 _NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "net_arch"}
@@ -147,9 +154,12 @@ def without_buffer(algorithm: str, hyperparameters: Hyperparameters) -> Hyperpar
 
 
 def _check_name(algorithm: str, name: str) -> None:
-    if name in _REFUSED:
-        raise InputError(f"{name} can't be set: {_REFUSED[name]}")
-    own = _OWN if ALGORITHMS[algorithm].learns_off_policy else _OWN - {"noise", "warm_up"}
+    refused, off_policy = _REFUSED, ALGORITHMS[algorithm].learns_off_policy
+    if off_policy:
+        refused = {**refused, "log_std_init": _NO_SDE}  # elsewhere it is that of all noise
+    if name in refused:
+        raise InputError(f"{name} can't be set: {refused[name]}")
+    own = _OWN if off_policy else _OWN - {"noise", "warm_up"}
     names = sorted({*_parameters(algorithm), *_policy_parameters(algorithm), *own})
     if name not in names:
         meant = [each for each in names if name == "".join(word[0] for word in each.split("_"))]

@@ -33,9 +33,8 @@ from jbrep.rl.agent import (
     one_line,
     preprocessor,
 )
-from jbrep.rl.checkpoint import PARAMETERS, Checkpoint, run_settings
+from jbrep.rl.checkpoint import PARAMETERS, Checkpoint
 from jbrep.rl.files import (
-    BEGINNING,
     CHECKPOINT,
     ENCODER,
     POLICY,
@@ -63,7 +62,6 @@ class Trained(NamedTuple):
     settings: RunSettings
     step: int | None = None  # of training, if it is not over
     statistics: Statistics | None = None  # by which it normalises what it sees, if it does
-    action_repeat: int = 1  # control steps for which each of its actions is held
 
     @property
     def representation(self) -> str:
@@ -73,7 +71,7 @@ class Trained(NamedTuple):
     @property
     def evaluation_episodes(self) -> int:
         """That the run's evaluations play at once."""
-        return self.settings.evaluation_episodes
+        return 1 if self.settings.one_robot else self.settings.evaluation_episodes
 
     def begin(self, task: Task, seeds: Any) -> Actor:
         """Act deterministically in episodes that begin now; nothing is drawn.
@@ -92,7 +90,8 @@ class Trained(NamedTuple):
         return self._held(deterministic_actor(self.policy, self.task, preprocess, batch_size=1))
 
     def _held(self, act: Actor) -> Actor:
-        return held(_finite(act), self.action_repeat, self.settings.chunk)
+        repeat = self.settings.hyperparameters.action_repeat
+        return held(_finite(act), repeat, self.settings.chunk)
 
     def with_weights(self, weights: Tensors, tensors: Tensors, source: Path) -> "Trained":
         """The policy with weights of the part that acts, and statistics among tensors."""
@@ -140,8 +139,7 @@ def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
         spaces = Spaces(*agent_spaces(task, encoder, settings.chunk))
         agent = make_agent(settings.algorithm, small, spaces, settings.seed)
     statistics = Statistics.untrained(encoder.latent_size) if shape.normalize else None
-    repeat = settings.hyperparameters.action_repeat
-    return Trained(agent.policy, task, encoder, settings, None, statistics, repeat)
+    return Trained(agent.policy, task, encoder, settings, None, statistics)
 
 
 def pack(trained: Trained, run: str) -> bytes:
@@ -225,16 +223,6 @@ def load_run(folder: Path, encoder: Any = None) -> Trained:
         if not name.startswith("optimizer.")
     }
     return built.with_weights(weights, tensors, path)
-
-
-def load_untrained(folder: Path) -> Trained:
-    """The policy that a run began with."""
-    settings = run_settings(folder)
-    built = _untrained(folder, settings, None)
-    if settings.begin_from is None:
-        return built
-    policy = read(folder / BEGINNING, settings.begin_from)
-    return built.with_weights(policy.weights, policy.tensors, policy.path)
 
 
 def _untrained(folder: Path, settings: RunSettings, given: Any) -> Trained:

@@ -37,7 +37,6 @@ from jbrep.records.storage import exclusive, exists, make_folder, read_file, wri
 from jbrep.records.tables import write_csv, write_rows
 from jbrep.rl.agent import (
     acting,
-    action_repeat,
     evaluate,
     make_agent,
     make_env,
@@ -349,12 +348,7 @@ def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | 
     policy, tables = b"", dict[str, str]()
     if not failed:
         trained = Trained(
-            agent.policy,
-            job.run.task,
-            job.encoder,
-            settings,
-            statistics=statistics_of(agent),
-            action_repeat=action_repeat(agent),
+            agent.policy, job.run.task, job.encoder, settings, statistics=statistics_of(agent)
         )
         policy = pack_whole(trained)
     if keeps:

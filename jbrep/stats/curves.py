@@ -48,7 +48,7 @@ def common_grid(group: Group) -> tuple[Array, str | None]:
     runs = list(chain.from_iterable(group.values()))
     whole = [run for run in runs if run.failed_at is None]
     start = max(_first(run) for run in runs)
-    end = min(_last(run) for run in whole or runs)
+    end = min([int(run.steps[-1]) for run in whole] or [run.total_steps for run in runs])
     if start >= end:
         raise InputError(
             f"{runs[0].task}/{runs[0].algorithm}: the evaluations of one run end at step {end}, "
@@ -63,10 +63,6 @@ def _first(run: RunCurve) -> int:
     """The first step of its curve: 0 if it failed before it was evaluated."""
     steps, _ = run.curve()
     return 0 if steps[0] == run.failed_at else int(steps[0])
-
-
-def _last(run: RunCurve) -> int:
-    return run.total_steps if run.failed_at is not None else int(run.steps[-1])
 
 
 def _cut(runs: list[RunCurve], end: int) -> str | None:

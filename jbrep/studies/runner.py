@@ -67,17 +67,13 @@ def work(assigned: Assigned, modules: Iterable[str] = ()) -> RunOutcome | None:
     except StoppedError:
         return None
     except Exception as error:
-        return _crashed(assigned, error)
+        path = assigned.folder / ERROR
+        write_note(path, "".join(traceback.format_exception(error)))
+        return RunOutcome(assigned.name, CRASHED, f"{first_line(error)}; see {path}")
     for leftover in (PROGRESS, ERROR):
         (assigned.folder / leftover).unlink(missing_ok=True)
     message = result.reason or f"{result.seconds / 60:.1f} min"
     return RunOutcome(assigned.name, result.status, message)
-
-
-def _crashed(assigned: Assigned, error: Exception) -> RunOutcome:
-    path = assigned.folder / ERROR
-    write_note(path, "".join(traceback.format_exception(error)))
-    return RunOutcome(assigned.name, CRASHED, f"{first_line(error)}; see {path}")
 
 
 class _Progress:

@@ -7,6 +7,7 @@ fork of a process in which torch has threads may wait for them for ever.
 
 import errno
 import hashlib
+import itertools
 import json
 import os
 import resource
@@ -71,7 +72,16 @@ def command(*arguments):
 
 def forked(act, folder, *, before=lambda: None, seconds=None):
     """Do something in a fork, to be killed after so many seconds; its exit code and its words."""
-    told = folder.with_suffix(".told")
+    child, told = _start(act, folder, before)
+    if seconds is not None:
+        time.sleep(seconds)
+        with suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+    return _end(child, told)
+
+
+def _start(act, folder, before=lambda: None, name="told"):
+    told = folder.with_suffix(f".{name}")
     told.touch()
     child = os.fork()
     if not child:
@@ -79,10 +89,10 @@ def forked(act, folder, *, before=lambda: None, seconds=None):
         with suppress(BaseException):
             code = _in_child(act, folder, before, told)
         os._exit(code)
-    if seconds is not None:
-        time.sleep(seconds)
-        with suppress(ProcessLookupError):
-            os.kill(child, signal.SIGKILL)
+    return child, told
+
+
+def _end(child, told):
     _, status = os.waitpid(child, 0)
     return os.waitstatus_to_exitcode(status), told.read_text(errors="replace")
 
@@ -108,23 +118,26 @@ def _in_child(act, folder, before, told):
     return 0
 
 
-def at_sync(number, do):
-    """Before that many points of synchronisation: do this."""
-    left = [number]
+def at_each_sync(do):
+    """Do this before each point of synchronisation."""
 
     def before():
         for name in SYNCS:
             call = getattr(os, name)
 
-            def counted(*arguments, call=call, **keywords):
-                left[0] -= 1
-                if left[0] == 0:
-                    do()
+            def noted(*arguments, call=call, **keywords):
+                do()
                 return call(*arguments, **keywords)
 
-            setattr(os, name, counted)
+            setattr(os, name, noted)
 
     return before
+
+
+def at_sync(number, do):
+    """Do this before one of them, counted from 1."""
+    numbers = itertools.count(1)
+    return at_each_sync(lambda: next(numbers) == number and do())
 
 
 def _die():
@@ -183,57 +196,33 @@ class Attacker:
     @cached_property
     def measured(self):
         """How often it comes to a point of synchronisation, and how long it takes [s]."""
-        folder, counted = self._new(), self.folder / "points"
+        folder, points, begun = self._new(), self.folder / "points", time.monotonic()
+        with points.open("ab", buffering=0) as file:
+            mark = at_each_sync(lambda: file.write(b"."))
+            assert forked(self.surface.act, folder, before=mark)[0] == 0
+        return points.stat().st_size, time.monotonic() - begun
 
-        def count():
-            counted.write_text("")
-            for name in SYNCS:
-                call = getattr(os, name)
-
-                def noted(*arguments, call=call, **keywords):
-                    with counted.open("a") as file:
-                        file.write(".")
-                    return call(*arguments, **keywords)
-
-                setattr(os, name, noted)
-
-        begun = time.monotonic()
-        assert forked(self.surface.act, folder, before=count)[0] == 0
-        return len(counted.read_text()), time.monotonic() - begun
-
-    def again(self, attack, folder, code):
-        """The same once more must come to what it comes to in peace."""
-        ended, told = forked(self.surface.act, folder)
-        is_done = ended == 0 or ("exists already" in told and in_one_line(told))
-        if not is_done:
-            self.tally.note(attack, code, f"not to be done again: {told[-300:]}")
-            return
-        result = self.surface.result(folder)
-        self.tally.note(attack, code, "" if result == self.expected else "another result")
+    def _some_points(self, most):
+        """Numbers of points of synchronisation, at most so many."""
+        every = np.arange(self.measured[0]) + 1
+        return sorted(self.random.permutation(every)[:most].tolist())
 
     def kills(self, count):
         """At points of synchronisation, every one where there are few, and at any time."""
-        total, seconds = self.measured
-        some = range(1, total + 1)
-        if total > count:
-            some = sorted(self.random.choice(total, count, replace=False) + 1)
-        for number in some:
+        for number in self._some_points(count):
             folder = self._new()
             code, _ = forked(self.surface.act, folder, before=at_sync(number, _die))
             self.again("killed at a sync", folder, code)
         for _ in range(count // 2):
             folder = self._new()
-            wait = self.random.uniform(0, seconds)
+            wait = self.random.uniform(0, self.measured[1])
             code, _ = forked(self.surface.act, folder, seconds=wait)
             self.again("killed at any time", folder, code)
 
     def full_disks(self, count):
         """An error at a point of synchronisation, and files that can't grow."""
-        total, _ = self.measured
-        some = range(1, total + 1)
-        if total > count:
-            some = sorted(self.random.choice(total, count, replace=False) + 1)
-        ways = [("full at a sync", at_sync(number, _disk_is_full)) for number in some]
+        numbers = self._some_points(count)
+        ways = [("full at a sync", at_sync(number, _disk_is_full)) for number in numbers]
         there, prepared = self.peace, self._new()  # what is there before needn't grow
         largest = max(
             path.stat().st_size
@@ -255,26 +244,15 @@ class Attacker:
         """Two at once: each does its work or says why not, and one result is there."""
         for _ in range(count):
             folder = self._new()
-            children = [self._start(folder, name) for name in ("a", "b")]
+            children = [_start(self.surface.act, folder, name=name) for name in ("a", "b")]
             codes = []
-            for child, told in children:
-                code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-                words = told.read_text(errors="replace")
+            for child in children:
+                code, words = _end(*child)
                 codes.append(code)
                 if code not in (0, 2) or (code == 2 and not in_one_line(words)):
                     self.tally.note("two at once", code, f"exit code {code}: {words[-400:]}")
             same = 0 in codes and self.surface.result(folder) == self.expected
             self.tally.note("two at once", sorted(codes), "" if same else "another result, or none")
-
-    def _start(self, folder, name):
-        told = folder.with_suffix(f".{name}")
-        child = os.fork()
-        if not child:
-            code = 1
-            with suppress(BaseException):
-                code = _in_child(self.surface.act, folder, lambda: None, told)
-            os._exit(code)
-        return child, told
 
     def damages(self, count):
         """Damage a file that is read: it is refused in a line, or nothing changes."""

@@ -27,10 +27,10 @@ def mistake(*arguments):
     return told.output
 
 
-def refused(use, *arguments):
+def refused(use, *arguments, **named):
     """The one line that a user of Python gets."""
     with pytest.raises(InputError) as error:
-        use(*arguments)
+        use(*arguments, **named)
     assert "\n" not in str(error.value)
     return str(error.value)
 

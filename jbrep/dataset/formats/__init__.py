@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.errors import InputError, choose, listed
+from jbrep.errors import InputError, choose, listed, refusing
 from jbrep.records.storage import exists
 
 if TYPE_CHECKING:
@@ -61,12 +61,16 @@ def open_sources(given: Sequence[str], layout: Layout | None = None, missing: st
     """Open files and folders that are to be imported together, or a Minari data set by its id."""
     from jbrep.dataset.formats.source import Source
 
-    paths = [Path(each).resolve() for each in given]
-    if twice := [each for each, path in zip(given, paths, strict=True) if paths.count(path) > 1]:
-        raise InputError(f"{twice[-1]} is given twice: leave one out")
-    before = _states(paths)
-    first, *others = [Source(load_reader(each).read(each), layout, missing) for each in given]
-    first.join(*others)
+    readers = [load_reader(each) for each in given]
+    with refusing(f"{listed(given)} can't be imported"):
+        paths = [Path(each).resolve() for each in given]
+        once = zip(given, paths, strict=True)
+        if twice := [each for each, path in once if paths.count(path) > 1]:
+            raise InputError(f"{twice[-1]} is given twice: leave one out")
+        before = _states(paths)
+        read = (reader.read(each) for reader, each in zip(readers, given, strict=True))
+        first, *others = [Source(frame, layout, missing) for frame in read]
+        first.join(*others)
     first.has_changed = lambda: _states(paths) != before
     return first
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.coordinates import wrapped
 from jbrep.dataset.formats.episodes import MOST_RAW, Counts, Rows, stretches, usual_step
 from jbrep.dataset.formats.frame import ENDS
 from jbrep.dataset.formats.roles import Leaf
@@ -131,8 +130,9 @@ def _signal(
     if is_linear:
         following = time[np.minimum(last + 1, len(time) - 1)]
         age = np.where(age > slack, np.maximum(age, following - time[last]), age)
-        even = np.interp(grid, time, np.unwrap(values) if leaf.is_angle else values)
-        even = wrapped(even) if leaf.is_angle else even
+        low = leaf.turns_at
+        even = np.interp(grid, time, values if low is None else np.unwrap(values))
+        even = even if low is None else low + (even - low) % (2 * np.pi)
     else:
         even = values[last].astype(float)
         passed = len(time) - len(np.unique(last))

@@ -237,11 +237,13 @@ def _held(episode: Incoming, most: int) -> Incoming:
             "the episode out, or give `missing` skip"
         )
     seen = np.concatenate((episode.observation, episode.final[None]))
-    reward = np.concatenate(([0.0], episode.reward))  # with the observation after it
+    reward = np.concatenate(([np.nan], episode.reward))  # with the observation after it
     rows = np.column_stack((seen, reward))
     number = np.arange(len(rows))[:, None]
     last = np.maximum.accumulate(np.where(np.isfinite(rows), number, -1))
-    for step, column in np.argwhere((last < 0) | (number - last > most))[:1]:
+    lacking = (last < 0) | (number - last > most)
+    lacking[0, -1] = False
+    for step, column in np.argwhere(lacking)[:1]:
         what = "the reward" if column == seen.shape[1] else f"feature {column}"
         is_first = last[step, column] < 0
         why = "with none before to hold" if is_first else f"beyond hold:{most} of the last one"

@@ -21,7 +21,7 @@ from jbrep.dataset.formats.parquet import batches_of, opened
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
-from jbrep.errors import InputError, refusing
+from jbrep.errors import InputError
 from jbrep.progress import Progress
 from jbrep.records.storage import publish, unfinished
 
@@ -54,13 +54,12 @@ def read(given: str) -> Frame:
     folder = Path(given)
     check_plain(folder)
     info = folder / INFO
-    with refusing(f"{info} isn't as LeRobot writes it"):
-        meta = json.loads(info.read_bytes())
-        version, fps = str(meta["codebase_version"]), float(meta["fps"])
-        features = {str(name): dict(each) for name, each in meta["features"].items()}
-        frames = int(meta["total_frames"]) if "total_frames" in meta else None
-        offsets = tuple(float(each) for each in meta.get(_OFFSETS, ()))
-        images = [name for name, each in features.items() if each["dtype"] in _IMAGES]
+    meta = json.loads(info.read_bytes())
+    version, fps = str(meta["codebase_version"]), float(meta["fps"])
+    features = {str(name): dict(each) for name, each in meta["features"].items()}
+    frames = int(meta["total_frames"]) if "total_frames" in meta else None
+    offsets = tuple(float(each) for each in meta.get(_OFFSETS, ()))
+    images = [name for name, each in features.items() if each["dtype"] in _IMAGES]
     if not version.startswith(_VERSIONS):
         raise InputError(f"{info} is of LeRobot's layout {version}: it must be v3.0 or v2.1")
     if not 0 < fps < np.inf:

@@ -33,7 +33,7 @@ from jbrep.envs.description import describe
 from jbrep.envs.names import spec_of
 from jbrep.envs.probe import features_of
 from jbrep.envs.task import Task
-from jbrep.errors import InputError, kind_and_line, listed, refusing
+from jbrep.errors import InputError, kind_and_line, listed
 from jbrep.progress import Progress
 from jbrep.records.storage import check_space, exists, make_folder, publish, unfinished, write_whole
 
@@ -54,7 +54,7 @@ def read(given: str) -> Frame:
     for path in sorted(folder.rglob("*.hdf5")):
         with opened(path):
             pass
-    with refusing(f"{given} can't be read as a Minari data set"), warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         metadata = json.loads((folder / _METADATA).read_bytes())
         if lacking := {"observation_space", "action_space"} - metadata.keys():

@@ -8,7 +8,6 @@ import numpy as np
 from jbrep.dataset.formats.arrays import frame_of_steps
 from jbrep.dataset.formats.frame import About, Frame, label_of
 from jbrep.dataset.reader import Dataset
-from jbrep.errors import refusing
 from jbrep.records.storage import publish, unfinished
 
 _EPISODES = "episodes/"  # of columns with a row for each episode, as jbrep writes them
@@ -26,10 +25,7 @@ _ABOUT = {"feature_names": str, "feature_units": str, "feature_offsets": float}
 def read(given: str) -> Frame:
     """Read all arrays; objects, which would have to be unpickled, are refused."""
     path = Path(given)
-    with (
-        refusing(f"{given} can't be read as an npz file"),
-        np.load(path, allow_pickle=False) as archive,
-    ):
+    with np.load(path, allow_pickle=False) as archive:
         arrays = {name: np.asarray(archive[name]) for name in archive.files}
         names, units, offsets = (
             tuple(kind(each) for each in arrays.pop(name, np.array(())).ravel())

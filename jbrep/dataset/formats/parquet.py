@@ -80,8 +80,9 @@ def _exported(path: Path, schema: pa.Schema, settings: bytes) -> dict[str, Any]:
     check_plain(beside)
     with opened(beside) as file:
         episodes = file.read()
-        final = np.stack(episodes["final_observation"].to_numpy())
-        once = {name: episodes[name].to_numpy() for name in (*ENDS, "seed")}
+        final = np.stack(episodes["final_observation"].to_numpy()).astype(np.float64)
+        once = {name: episodes[name].to_numpy() for name in ENDS}
+        once["seed"] = np.array(episodes["seed"].to_pylist(), np.int64)
     offsets = zip(task.features, task.offset.tolist(), strict=True)
     return {
         "task": task,

@@ -42,6 +42,13 @@ class Leaf(NamedTuple):
     feature: Feature | None
     is_angle: bool = False
 
+    @property
+    def turns_at(self) -> float | None:
+        """Where its turn begins, if it is an angle that jumps to the other end there."""
+        if self.is_angle:
+            return -math.pi
+        return self.feature.low if self.feature and self.feature.is_full_turn else None
+
 
 Roles = Mapping[str, list[Leaf]]  # by the keys of ALIASES, and time
 
@@ -198,11 +205,11 @@ class Turns:
         self._jump = np.array(0.0)
 
     def see(self, values: NDArray[np.float64]) -> None:
-        """Look at consecutive rows, (n, d)."""
-        jump = np.abs(np.diff(values, axis=0)).max(axis=0, initial=0)
-        self._jump = np.fmax(self._jump, jump)
-        self._low = np.fmin(self._low, values.min(axis=0))
-        self._high = np.fmax(self._high, values.max(axis=0))
+        """Look at consecutive rows, (n, d), with NaN where nothing was read."""
+        read = [column[np.isfinite(column)] for column in values.T]
+        self._jump = np.fmax(self._jump, [np.abs(np.diff(each)).max(initial=0) for each in read])
+        self._low = np.fmin(self._low, [each.min(initial=np.inf) for each in read])
+        self._high = np.fmax(self._high, [each.max(initial=-np.inf) for each in read])
 
     def found(self) -> list[float]:
         """The turn of each number, (d,); 0 where there is none."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jbrep.coordinates import wrapped
 from jbrep.dataset.formats.clock import in_parts, same_clock, timestep_of
 from jbrep.dataset.formats.episodes import Counts, Incoming, Rows, cut, episode_of
-from jbrep.dataset.formats.frame import Frame, width
+from jbrep.dataset.formats.frame import ENDS, Frame, width
 from jbrep.dataset.formats.roles import (
     DEGREES,
     MOST_RADIANS,
@@ -30,6 +30,7 @@ from jbrep.dataset.formats.roles import (
     second_of,
 )
 from jbrep.dataset.layout import Layout
+from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line, listed, refusing
 from jbrep.text import counted
 
@@ -69,7 +70,6 @@ class Source:
         self._columns = list(dict.fromkeys(column for _, column in used))
         self._numeric = {column for role, column in used if role not in _EXACT}
         seen, is_own = self._roles["observation"], is_of_task(frame, self._roles)
-        self._leaves = [leaf for role in _SIGNALS for leaf in self._roles.get(role, ())]
         self._turns = Turns()
         self._angles = np.array([each.is_angle for each in seen])
         degrees = self._angles & np.array([each.unit in DEGREES for each in seen])
@@ -105,6 +105,13 @@ class Source:
         self.timestep = self.timestep if all(each.timestep for each in every) else None
         self.rows = sum(each.rows or 0 for each in every) if all(e.rows for e in every) else None
 
+    def interpolate_as(self, task: Task) -> None:
+        """Take the angles of a task's features the shorter way round."""
+        for source in (self, *self._others):
+            known = zip(source._roles["observation"], task.features, strict=False)
+            seen = [leaf._replace(feature=feature) for leaf, feature in known]
+            source._roles = {**source._roles, "observation": seen}
+
     def changes(self) -> Counts:
         """What was done to the rows that were read last."""
         return sum((other.changes() for other in self._others), +self._counts)
@@ -115,19 +122,25 @@ class Source:
         self._turns = Turns()
         name, known, count = self.frame.name, {**self.frame.once}, 0
         final, seen = self.frame.final, self._roles["observation"]
+        leaves = [leaf for role in _SIGNALS for leaf in self._roles.get(role, ())]
         if final and {leaf.column for leaf in seen} <= final.keys():
             chosen = np.stack([_part(final[leaf.column], leaf) for leaf in seen], axis=1)
             known["final_observation"] = self._turned(chosen)
         for where, rows in cut(name, self._rows(), self._layout, self._counts):
+            self._turns.see(rows["observation"])
             ends = {what: values[count] for what, values in known.items() if count < len(values)}
+            if self._layout.rate and "final_observation" in ends:  # it has a time, too
+                following = np.vstack((rows["observation"][1:], ends.pop("final_observation")))
+                is_last = np.arange(len(following)) == len(following) - 1
+                flags = {flag: is_last * ends.pop(flag) for flag in ENDS if flag in ends}
+                rows = {**rows, "next_observation": following, **flags}
             seed = {"seed": ends.pop("seed")} if "seed" in ends else {}
-            parts = [*in_parts(rows, self._layout, self._leaves, self._counts)]
+            parts = [*in_parts(rows, self._layout, leaves, self._counts)]
             for i, part in enumerate(parts):
                 once = (seed if i == 0 else {}) | (ends if i == len(parts) - 1 else {})
                 episode = episode_of(where, part, once)
                 self._counts[LAST] += len(part["action"]) - (len(episode.action) if episode else 0)
                 if episode:
-                    self._turns.see(episode.observation)
                     yield episode
             count += 1
         for what, values in known.items():

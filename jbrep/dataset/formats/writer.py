@@ -167,6 +167,7 @@ def write(
             task = task or source.task
             fitting = _fitting(source, survey, task) if task else _from_data(source, survey)
             fitting = with_features(fitting, features) if features else fitting
+            source.interpolate_as(fitting)
             given = Signals(*(ends + source.subtracted for ends in survey.signals))
             for problem in precision_problems(fitting, given):
                 warnings.warn(problem, Notice, stacklevel=2)
@@ -185,7 +186,10 @@ def write(
 
 def _check_alike(source: Source, task: Task) -> None:
     """Refuse features that are named as the task's but are others, and another clock."""
-    for own, each in zip(task.features, source.features, strict=False):
+    features, timestep = source.features, source.timestep
+    if source.task:
+        features, timestep = source.task.features, timestep or source.task.timestep
+    for own, each in zip(task.features, features, strict=False):
         if each.name != own.name and each.name in task.feature_names:
             raise InputError(
                 f"{source.name} has {each.name!r} where {task.name} has {own.name!r}: name the "
@@ -196,8 +200,8 @@ def _check_alike(source: Source, task: Task) -> None:
                 f"{source.name} has {each.name!r} in {each.unit}, and {task.name} in {own.unit}: "
                 "bring it to that unit"
             )
-    if not same_clock(source.timestep, task.timestep):
-        step, expected = source.timestep or 0, task.timestep or 1
+    if not same_clock(timestep, task.timestep):
+        step, expected = timestep or 0, task.timestep or 1
         raise InputError(
             f"rows of {source.name} are {step:.4g} s apart, but steps of {task.name} take "
             f"{expected:.4g} s: give `rate` {1 / expected:.6g}"

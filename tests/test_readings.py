@@ -1,24 +1,32 @@
-"""What a second reader of the code broke: each is a line, or works."""
+"""What readers of the code broke: each is a line, or works."""
 
 import json
+import subprocess
 import sys
 import time
 
 import gymnasium
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
+import torch
 from command import jbrep, mistake, refused
 from gymnasium.spaces import Box
 from small import brief as settings
 from small import write_again
 
+from jbrep import api
 from jbrep.collecting.policies import Heuristic
-from jbrep.dataset import DamageError, Dataset
+from jbrep.dataset import DamageError, Dataset, Layout, ScaledDataset, from_file, from_table
 from jbrep.dataset.manifest import find_problems, open_shard
+from jbrep.encoders import Encoder, find
 from jbrep.envs import describe
 from jbrep.envs.autoreset import AutoresetEnvironments
+from jbrep.envs.description import with_features
 from jbrep.envs.environments import Environments
-from jbrep.errors import STEP_TIMEOUT, InputError
+from jbrep.errors import STEP_TIMEOUT, InputError, Notice
+from jbrep.evaluation.diagnosis import seen
+from jbrep.inspection.scene import as_qpos
 from jbrep.play.references import policies_of
 from jbrep.records.record import from_plain
 from jbrep.rl.normalization import Statistics
@@ -187,3 +195,145 @@ def test_rewards_of_ones_own_stay_known(brief, tmp_path, monkeypatch):
 
 def test_a_history_too_long_is_named():
     assert "history" in refused(lambda: describe("face_direction", history=1000))
+
+
+TASK = describe("face_direction")
+made = []
+
+
+class Robot(gymnasium.Env):
+    """Counts how often it is made, and can be switched off."""
+
+    observation_space, action_space, off = Box(-9, 9, (2,)), Box(-1, 1, (1,)), False
+
+    def __init__(self):
+        made.append(self)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.float32([1, 2]), {}
+
+    def step(self, action):
+        if Robot.off:
+            raise RuntimeError("the robot is off")
+        return np.float32([1, 2]) + action, 0.5, False, False, {}
+
+
+gymnasium.register("SecondReading/Robot-v0", Robot, max_episode_steps=5)
+
+
+def named(*names):
+    rows = [{"name": name, "unit": name} for name in names]
+    return describe("SecondReading/Robot-v0", features={"features": rows})
+
+
+def test_a_clone_is_played_by_one_robot_and_kept_where_that_fails(tmp_path, monkeypatch):
+    data = api.collect(named("a", "b"), tmp_path / "data", steps=50, threads=1)
+    quick, before = {"steps": 20, "episodes": 6, "threads": 1}, len(made)
+    api.clone(data, tmp_path / "one", **quick)
+    assert len(made) - before <= 1
+    monkeypatch.setattr(Robot, "off", True)
+    with pytest.warns(Notice, match="the robot is off"):
+        lost = api.clone(data, tmp_path / "off", **quick)
+    assert lost.policy([1.0, 2.0]).shape == (1,)
+    (tmp_path / "rl").mkdir()
+    (tmp_path / "rl/checkpoint.safetensors").touch()  # of a run that goes on
+    assert "rl" in refused(api.clone, data, tmp_path / "rl", **quick)
+
+
+def test_options_that_would_do_nothing_are_refused(tmp_path):
+    file = tmp_path / "it.onnx"
+    jbrep("policy", "export", "trained", "--task", "face_direction", "--out", file)
+    assert "encoder" in mistake("evaluate-policy", file, "--encoder", "dae-4")
+    assert "--beside" in mistake("evaluate-policy", file, "--perturb", "--beside", "uniform")
+    for algorithm, name in (("sac", "log_std_init"), ("tqc", "use_expln"), ("ppo", "full_std")):
+        assert name in refused(overridden, algorithm, "modern", {name: 1})
+
+
+def test_an_encoder_from_torch_takes_what_has_gradients():
+    encoder = Encoder.from_torch(torch.nn.Linear(16, 3), "face_direction")
+    assert encoder(torch.zeros(2, 16, requires_grad=True)).shape == (2, 3)
+
+
+def test_the_jitterbug_is_drawn_whatever_its_features_are_called():
+    rows = [{"name": f"f{i}", "group": "g", "kind": "scalar"} for i in range(TASK.size)]
+    other = describe("face_direction", features={"features": rows})
+    observation = np.random.default_rng(0).normal(size=(3, TASK.size))
+    np.testing.assert_array_equal(as_qpos(other, observation), as_qpos(TASK, observation))
+
+
+def test_what_learned_nothing_saw_no_row(collected):
+    assert (
+        seen(find("coordinates", describe("InvertedPendulum-v5")), ScaledDataset.of(collected))
+        == "none"
+    )
+
+
+def test_statistics_of_large_numbers_keep_their_digits():
+    """Also in single precision, as policies elsewhere compute."""
+    known = Statistics(np.array([5e6 + 0.3]), np.ones(1), 1.0)
+    rows = np.float32([[5e6], [5e6 + 1]])
+    mean, rest, deviation = known.arrays
+    np.testing.assert_allclose((rows - mean - rest) / deviation, known(rows), atol=1e-6)
+
+
+def test_angles_of_a_task_are_interpolated_the_shorter_way(tmp_path):
+    times = np.arange(60) / 50
+    table = dict.fromkeys(TASK.feature_names, np.sin(times)) | {"t": times, "action": np.sin(times)}
+    table["motor_angle"] = np.angle(np.exp(1j * (2.6 + 5 * times)))
+    layout = Layout(observations=TASK.feature_names, time="t", rate=100, fill="linear")
+    data = from_table(tmp_path / "data", table, layout, task=TASK)
+    expected = 2.6 + np.arange(len(data)) / 20
+    np.testing.assert_allclose(np.exp(1j * data["motor_angle"][:]), np.exp(1j * expected), 1e-5)
+
+
+def test_a_final_observation_is_a_reading_of_the_clock(tmp_path):
+    times, file = np.arange(100) / 100, tmp_path / "some.npz"
+    seen = np.stack((times, times), axis=1)
+    arrays = {"actions": times[:, None], "t": times, "terminations": times == 0.99}
+    finals = {"final_observations": np.ones((1, 2))}
+    for name, known in (("once", finals), ("each", {"next_observations": seen + 0.01})):
+        np.savez(file, observations=seen, **arrays, **known)
+        data = from_file(tmp_path / name, file, layout=Layout(time="t", rate=1000, fill="linear"))
+        assert (len(data), data.episodes["terminated"].tolist()) == (1000, [True])
+    seen[50:, 1] = np.nan  # silent, so that the last observation belongs to no step
+    np.savez(file, observations=seen, **arrays, **finals)
+    data = from_file(tmp_path / "silent", file, layout=Layout(time="t", rate=100, gap=0.1))
+    assert data.episodes["final_observation"][0] == pytest.approx([0.59, 0.49])
+    assert not data.episodes["terminated"][0]
+
+
+def test_columns_of_another_order_and_odd_episodes_are_refused(tmp_path):
+    data = api.collect(named("a", "b"), tmp_path / "data", steps=10)
+    file = tmp_path / "it.parquet"
+    jbrep("data", "export", data.folder, "--to", "parquet", "--out", file)
+    assert "'a' where" in refused(from_file, tmp_path / "no", file, task=named("b", "a"))
+    beside = tmp_path / "it-episodes.parquet"
+    table = pq.read_table(beside)
+    for name in ("seed", "final_observation"):
+        place, words = table.schema.get_field_index(name), [["x"] * len(table)]
+        pq.write_table(table.set_column(place, name, words), beside)
+        assert "can't be read" in refused(from_file, tmp_path / "no", file)
+
+
+def test_numbers_that_begin_with_a_point_and_offsets_that_stay():
+    domain = describe("face_direction", domain={"noise": ".1", "mass": ".5..1.5"}).domain
+    assert (domain.noise, domain.mass) == ((0.1, 0.1), (0.5, 1.5))
+    assert describe("SecondReading/Robot-v0", action_bounds="-.5...5").action_low == (-0.5,)
+    rows = [{"name": "a", "offset": 5.0, "low": -1.0}, {"name": "b"}]
+    task = describe("SecondReading/Robot-v0", features={"features": rows})
+    again = with_features(task, {"features": [{"name": "c"}, {"offset": 1.0}]})
+    assert again.offsets == {"c": 5.0, "b": 1.0}
+
+
+def test_a_reward_before_any_is_missing(tmp_path):
+    table = {"t": np.arange(6.0), "x": np.arange(6.0), "u": np.arange(6.0)}
+    table["reward"] = [np.nan, *[5.0] * 5]
+    layout = Layout(observations=("x",), actions=("u",), time="t")
+    assert "the reward is" in refused(from_table, tmp_path / "no", table, layout, missing="hold:1")
+
+
+def test_a_class_of_a_script_has_the_same_digest_in_each_process():
+    script = "class A: pass\nfrom jbrep.envs.names import digest_of\nprint(digest_of(A))"
+    runs = [subprocess.run([sys.executable, "-c", script], capture_output=True) for _ in "ab"]
+    assert runs[0].stdout == runs[1].stdout != b""
