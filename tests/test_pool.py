@@ -114,8 +114,8 @@ def test_a_run_that_kills_its_workers_crashes_alone(monkeypatch):
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:9", "ray://127.0.0.1:9", "no such; thing"])
+@pytest.mark.usefixtures("ray")
 def test_a_cluster_that_is_not_there_is_told_at_once(address, monkeypatch):
-    pytest.importorskip("ray")
     monkeypatch.setenv("RAY_ADDRESS", address)
     with pytest.raises(InputError, match=f"^no Ray cluster at RAY_ADDRESS={address}: "):
         on_cluster(print, 1, 0)
@@ -129,11 +129,16 @@ def test_a_container_has_less_memory_than_its_machine(limit, tmp_path, monkeypat
     assert machine.memory() == 256 << 20
 
 
-ray = pytest.importorskip("ray")
 STUDY = TINY.replace(seeds=(0,), steps=1000, evaluate_every=1000)
 
 
+@pytest.fixture
+def ray():
+    return pytest.importorskip("ray")
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("ray")
 def test_on_a_cluster_that_loses_a_node_a_study_comes_to_the_same_end(tmp_path):
     told = subprocess.run(
         [sys.executable, Path(__file__).parent / "helpers" / "cluster.py", tmp_path],
@@ -153,7 +158,7 @@ def test_on_a_cluster_that_loses_a_node_a_study_comes_to_the_same_end(tmp_path):
         np.testing.assert_array_equal(ours.returns, theirs.returns)
 
 
-def test_runs_whose_workers_are_killed_say_so(tmp_path, monkeypatch):
+def test_runs_whose_workers_are_killed_say_so(ray, tmp_path, monkeypatch):
     """Without a cluster, whose five workers would take a minute."""
 
     def get(reference):
