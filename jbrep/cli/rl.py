@@ -19,17 +19,20 @@ def _rl(task: DrawnTask, out: Path, **options: Annotated[Any, api.train]) -> boo
         from jbrep.encoders.shipped import source_of
         from jbrep.envs.infos import shares_text
         from jbrep.envs.make import is_one_robot
-        from jbrep.rl.files import EVALUATIONS, RUN, last_infos, read_evaluations, read_infos
+        from jbrep.rl import files
 
         with _reported_when_stopped(received, f"; {RESUMES}" if task.reproducible else ""):
             agent = api.train(task, out, stop=lambda: bool(received), **options)
     if agent.record.reason is not None:
-        say(f"the run failed: {agent.record.reason}; see {out / RUN}", err=True)
-        tell("to train it again, remove the folder or choose another --out", err=True)
+        kept, how = files.read_run(out), "remove the folder or choose another --out"
+        if kept.reason is None:  # it went on after fewer steps
+            how = f"choose another --out: {out} is as it was after {kept.steps:,} steps"
+        say(f"the run failed: {agent.record.reason}; see {out / files.RUN}", err=True)
+        tell(f"to train it again, {how}", err=True)
         return True
     returns = agent.returns
     shown = f"final return on {agent.record.settings.representation}"
-    if shares := shares_text(last_infos(read_infos(out), read_evaluations(out))):
+    if shares := shares_text(files.last_infos(files.read_infos(out), files.read_evaluations(out))):
         tell(shares)
     with stoppable("the run itself is finished"):
         from jbrep.play.references import beside, mean_text  # which import scipy.stats
@@ -38,7 +41,7 @@ def _rl(task: DrawnTask, out: Path, **options: Annotated[Any, api.train]) -> boo
         compared = None if alone else beside(task, returns)
         tell(f"{shown} {compared or mean_text(task, returns)}")
     tell(f"encoder: {source_of(options.get('encoder', 'full'), task)}; all evaluations:")
-    say(str(out / EVALUATIONS))
+    say(str(out / files.EVALUATIONS))
     return False
 
 

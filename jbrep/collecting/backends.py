@@ -31,9 +31,11 @@ def local(simulator: Simulator) -> Produce:
     """A batch's episodes in turn on threads; other environments' side by side in processes."""
     workers = simulator.num_threads or cores()
     task = simulator.settings.task
-    if is_batched(task) or workers == 1 or not _can_be_sent(spec_of(task), simulator):
+    # those of dm_control can't be sent, and are registered wherever they are asked for
+    spec = None if task.id.startswith("dm_control/") else spec_of(task)
+    if is_batched(task) or workers == 1 or not _can_be_sent(spec, simulator):
         return simulator.in_turn
-    return _in_processes(replace(simulator, num_envs=1, num_threads=1), workers)
+    return _in_processes(replace(simulator, num_envs=1, num_threads=1), workers, spec)
 
 
 def _can_be_sent(*parts: Any) -> bool:
@@ -47,7 +49,7 @@ def _can_be_sent(*parts: Any) -> bool:
         return False
 
 
-def _in_processes(simulator: Simulator, workers: int) -> Produce:
+def _in_processes(simulator: Simulator, workers: int, spec: EnvSpec | None) -> Produce:
     """Pieces made side by side, given in order; one whose worker is killed is made again."""
 
     def produce(growth: Growth, tick: Tick) -> Iterator[Columns]:
@@ -56,7 +58,7 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
             yield from simulator.in_turn(growth, tick)
             return
         begin, waiting, made = growth.episodes, deque[range](), dict[range, Made]()
-        known = imported_modules(), spec_of(simulator.settings.task)
+        known = imported_modules(), spec
         close_kept()  # the workers have their own
 
         def next_piece() -> range | None:
@@ -85,14 +87,15 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
 
 
 def make_episodes(
-    known: tuple[tuple[str, ...], EnvSpec], simulator: Simulator, episodes: range
+    known: tuple[tuple[str, ...], EnvSpec | None], simulator: Simulator, episodes: range
 ) -> Made:
     """Make some episodes of one shard, in a process of its own."""
     modules, spec = known  # to import, and what the environment is, if none of them registers it
     made: Made = []
     try:
         import_modules(modules)
-        gymnasium.registry.setdefault(spec.id, spec)
+        if spec:
+            gymnasium.registry.setdefault(spec.id, spec)
         for block in simulator.made(episodes, _stop_on_request):
             made.append(block)
     except InputError as error:

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import cache
 from io import TextIOBase
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +30,7 @@ class _Global(NamedTuple):
 
 def _directory() -> str | None:
     with suppress(OSError):  # it may be deleted
-        return str(Path.cwd())
+        return os.getcwd()  # noqa: PTH109, Path.cwd takes ten times as long
     return None
 
 
