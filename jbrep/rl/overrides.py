@@ -51,6 +51,7 @@ _FREQUENCY = Annotated[  # of two parts, but msgspec 0.22 crashes on that beside
     Meta(min_length=2, max_length=2),
 ]
 _OWN = {*Hyperparameters.__struct_fields__} - {"algorithm_kwargs", "policy_kwargs"}
+_NO_SDE = "a checkpoint has no noise on features"
 _REFUSED = {  # arguments that are jbrep's own, with the reason
     "device": "give it by --device",
     "policy_kwargs": "set its parts by their own names, such as net_arch or activation_fn",
@@ -78,7 +79,7 @@ _REFUSED = {  # arguments that are jbrep's own, with the reason
             *("use_sde", "sde_sample_freq", "use_sde_at_warmup"),
             *("use_expln", "full_std", "clip_mean"),
         ),
-        _NO_SDE := "a checkpoint has no noise on features",
+        _NO_SDE,
     ),
 }
 _NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "net_arch"}
