@@ -18,33 +18,26 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders.layers import Layer
+from jbrep.training import settings
 from jbrep.training.method import Network, Reconstructing
 from jbrep.training.network import get_architecture, layers, seeded, stack
 from jbrep.training.objective import Layers, Objective, feature_weights
-from jbrep.training.settings import (
-    Architecture,
-    BatchSize,
-    Epochs,
-    LearningRate,
-    TransitionWeight,
-    Weight,
-)
 from jbrep.training.windows import Windows
 
 _LEAST, _MOST = -7.0, 7.0  # log standard deviation of a posterior
 _RECONSTRUCTED = math.log(0.01), math.log(10)  # the same of a reconstruction
 _SINGULAR = 1e-6  # least |1 + v' r|
 
-Beta = Annotated[Weight, Meta(description="Weight of the divergence from the prior.")]
+Beta = Annotated[settings.Weight, Meta(description="Weight of the divergence from the prior.")]
 
 
 class Variational(Network, Reconstructing, frozen=True, kw_only=True):
     """A method whose code has a distribution."""
 
-    architecture: Architecture = "deep"
+    architecture: settings.Architecture = "deep"
     beta: Beta = 0.001
-    batch_size: BatchSize = 256
-    learning_rate: LearningRate = 1e-3
+    batch_size: settings.BatchSize = 256
+    learning_rate: settings.LearningRate = 1e-3
 
 
 class Vae(Variational, frozen=True, kw_only=True):
@@ -55,7 +48,7 @@ class Vae(Variational, frozen=True, kw_only=True):
 
     name: ClassVar[str] = "vae"
 
-    epochs: Epochs = 5
+    epochs: settings.Epochs = 5
 
     def objective(self, data: ScaledDataset) -> Objective:
         return VaeObjective(self, data)
@@ -168,8 +161,8 @@ class LldVae(Variational, frozen=True, kw_only=True):
     name: ClassVar[str] = "lld-vae"
 
     beta: Beta = 1.0
-    transition: TransitionWeight = 0.1
-    batch_size: BatchSize = 1000
+    transition: settings.TransitionWeight = 0.1
+    batch_size: settings.BatchSize = 1000
 
     def objective(self, data: ScaledDataset) -> Objective:
         return LldVaeObjective(self, data)

@@ -17,6 +17,7 @@ from jbrep.play.pictures import Camera, add_caption, join
 from jbrep.play.rollout import Rollout
 from jbrep.progress import Progress
 from jbrep.records.storage import exists, make_folder, taken, write_new
+from jbrep.text import rounded
 
 _WIDEST = 7680  # [pixels]
 _X264 = {"crf": "18", "preset": "medium"}  # no loss that the eye can see
@@ -93,7 +94,8 @@ class Film:
         for state in np.minimum(self.states, len(rollout)).tolist():
             picture = Image.fromarray(self.camera.picture(rollout.motion, state))
             so_far, now = rollout.reward[:state].sum(dtype=np.float64), self.timestep * state
-            add_caption(picture, rollout.name, f"return {so_far:.0f}    {now:.2f} s")
+            known = f"return {rounded(so_far)[0]}    " if np.isfinite(so_far) else ""
+            add_caption(picture, rollout.name, f"{known}{now:.2f} s")
             yield picture
 
     def write(self, path: Path, show: bool = False) -> None:

@@ -67,7 +67,7 @@ def judge(evaluation: Evaluation) -> Advice:
     ranked = sorted((label for label in r2 if label != FULL), key=lambda label: -r2[label])
     enough = [label for label in ranked if r2[label] >= threshold]
     predictive = [label for label in ranked if r2[label] >= _PREDICTED]
-    nearest = min(predictive, key=lambda label: bool(misses[label]), default=None)
+    nearest = next(iter(predictive), None)
     complete = [label for label in enough if not misses[label]]
     size = {label: evaluation.encoders[label].latent for label in enough}
     return Advice(by, enough, min(complete or enough, key=size.__getitem__, default=None), nearest)

@@ -56,10 +56,11 @@ def prospects(planned: Planned, units: dict[Stated, int]) -> Iterator[Prospect]:
 
 
 def _least_p(claim: Stated, units: int) -> float:
-    """Two-sided: of swaps of sides, of which there are so many; that of a mean can be any."""
+    """Two-sided, of swaps of sides as `spread_p` draws them; that of a mean can be any."""
     if claim.claim.name != LESS_VARIABLE.name:
         return 0.0
-    return 2 / min(2**units, PERMUTATIONS + 1)
+    same = (np.random.default_rng(0).random((PERMUTATIONS, units)) >= 0.5).all(axis=1).sum()
+    return float(2 * (1 + same) / (1 + PERMUTATIONS))
 
 
 @lru_cache(256)

@@ -112,13 +112,15 @@ def with_failure_returns(runs: Sequence[RunCurve]) -> list[RunCurve]:
     """The same runs with what a failed one counts as: the worst of its task and algorithm.
 
     That is the least possible return of the task where it is known, else the worst return of any
-    episode in which a run of that task and algorithm was evaluated, whatever its representation.
-    Where none was evaluated, it stays as it was.
+    episode in which a run of that task and algorithm was evaluated, whatever its representation, or
+    the best blind baseline if that is less. Where none was evaluated, it stays as it was.
     """
     worst: dict[Key, float] = {}
     for run in runs:
         every = np.concatenate([*run.evaluations, [np.inf]])
-        seen = every.min() if run.return_floor is None else run.return_floor
+        blind = (run.reference, run.reference_in_training) if len(run.steps) else ()
+        seen = min([every.min(), *(each for each in blind if each is not None)])
+        seen = seen if run.return_floor is None else run.return_floor
         key = run.task, run.algorithm
         worst[key] = min(worst.get(key, np.inf), float(seen))
     known = {key: value for key, value in worst.items() if np.isfinite(value)}

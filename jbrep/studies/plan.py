@@ -7,13 +7,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
+from jbrep.envs.names import environment_versions
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.records.commit import CHANGES, commits, in_work_tree, is_committed
@@ -107,8 +108,8 @@ class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
         used = {run.settings.name: run.settings.encoder for run in runs}
         if other := _others(used, used | self.encoders):
             found.append(f"{len(other)} of its runs have other encoders than were registered")
-        for name, version in self.versions.items():
-            if others := {run.versions.get(name, "none") for run in runs} - {version}:
+        for name, version in self.versions.items():  # some are of one task's environment alone
+            if others := {run.versions.get(name, version) for run in runs} - {version}:
                 found.append(f"{name} was {_listed(sorted(others))}, not {version}")
         found += self._other_code({run.commits.get("jbrep") for run in runs})
         if other := _others(policies, self.policies):
@@ -288,7 +289,7 @@ class Plan:
     def fingerprints(self) -> dict[str, str]:
         """The SHA-256 of encoders that the study doesn't make, by the name of the run."""
         return {
-            cell.name: self.run(cell).find_encoder().fingerprint
+            f"{cell.label}/seed-{cell.seed}": self.run(cell).find_encoder().fingerprint
             for cell in self.cells
             if not (self.study.data and isinstance(cell.representation, ByName))
         }
@@ -376,13 +377,14 @@ class Plan:
 
     def to_register(self, policies: dict[str, str]) -> Registration:
         """What is going to be run, as it is now, and the policies that will collect data."""
+        used = [environment_versions(self.task(name)).items() for name in self.study.tasks]
         return Registration(
             study=to_plain(self.study),
             encoders=self.fingerprints,
             policies=policies,
             data=self.existing_data,
             date=datetime.now(UTC).isoformat(timespec="seconds"),
-            versions=packages(),
+            versions=packages() | dict(chain(*used)),
             commits=dict(commits()),
             committed=self.in_git,
         )

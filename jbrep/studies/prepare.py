@@ -148,8 +148,9 @@ class NeededData:
             return True
         if not exists(self.folder / MANIFEST):
             return False
-        manifest = read_manifest(self.folder)
-        return manifest.complete and manifest.settings.steps == self.data.steps
+        there = read_manifest(self.folder)
+        wanted = self.to_collect()[0].replace(shard_episodes=there.settings.shard_episodes)
+        return there.complete and there.settings == wanted  # or it is refused where it is made
 
     @property
     def is_made(self) -> bool:

@@ -19,16 +19,7 @@ from jbrep.records.document import read_document
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
 from jbrep.records.tables import read_rows, write_csv, write_rows
-from jbrep.rl.files import (
-    ENCODER,
-    FAILED,
-    RUN,
-    RunRecord,
-    read_evaluations,
-    read_infos,
-    read_run,
-    runs_below,
-)
+from jbrep.rl import files
 from jbrep.stats import RunCurve
 from jbrep.stats.scale import best_blind
 from jbrep.studies.plan import STUDY
@@ -113,13 +104,13 @@ class Tables(NamedTuple):
 
 def has_runs(folder: Path) -> bool:
     """Whether a run below a folder has ended, or it is of a study that has no tables yet."""
-    return any(folder.rglob(RUN)) or (exists(folder / STUDY) and not exists(folder / RECORD))
+    return any(folder.rglob(files.RUN)) or (exists(folder / STUDY) and not exists(folder / RECORD))
 
 
 def check_tables(folder: Path) -> None:
     """Make sure that a folder has the tables of a study."""
     if not exists(folder / RECORD):
-        if any(folder.rglob(ENCODER)):
+        if any(folder.rglob(files.ENCODER)):
             raise InputError(f"no run in {folder} has ended yet: report them then")
         raise InputError(
             f"{folder} is not the folder of a study: it has neither runs nor a {RECORD}"
@@ -157,7 +148,7 @@ def _references(folder: Path, known: Mapping[str, str]) -> References:
 def write_tables(folder: Path) -> None:
     """Write the tables of the runs below a folder, of a study or not, as far as they have ended."""
     ended = _ended(folder)
-    returns, infos = _of_runs(ended, read_evaluations), [*_of_runs(ended, read_infos)]
+    returns, infos = _of_runs(ended, files.read_evaluations), [*_of_runs(ended, files.read_infos)]
     record = RunsRecord.of(folder, ended)
     tables = dict(_lasting(folder, record.tasks))
     tables[RETURNS] = write_rows(folder / RETURNS, (Return(*row) for row in returns), Return)
@@ -179,16 +170,16 @@ def _lasting(folder: Path, tasks: Mapping[str, Task]) -> Iterator[tuple[str, str
             yield name, sha256
 
 
-def _ended(folder: Path) -> dict[Path, RunRecord]:
+def _ended(folder: Path) -> dict[Path, files.RunRecord]:
     """The runs that have ended, by folder."""
-    folders = runs_below(folder)
+    folders = files.runs_below(folder)
     if not folders:
         resumed = exists(folder / STUDY)
         what_to_do = (
             "jbrep study resumes it" if resumed else "train one with jbrep rl or jbrep study"
         )
         raise InputError(f"no finished run below {folder}: {what_to_do}")
-    ended = {each: read_run(each) for each in folders}
+    ended = {each: files.read_run(each) for each in folders}
     known: dict[tuple[str, int], Path] = {}
     for each, run in ended.items():
         other = known.setdefault((run.settings.label, run.settings.seed), each)
@@ -201,7 +192,7 @@ def _ended(folder: Path) -> dict[Path, RunRecord]:
 
 
 def _of_runs(
-    ended: Mapping[Path, RunRecord], read: Callable[[Path], Iterable[NamedTuple]]
+    ended: Mapping[Path, files.RunRecord], read: Callable[[Path], Iterable[NamedTuple]]
 ) -> Iterator[list[Any]]:
     """The rows of a table that runs have, each after what tells its run, by label and seed."""
     runs = ((run.settings, folder) for folder, run in ended.items())
@@ -281,7 +272,7 @@ def _curve(tables: Tables, run: RunFacts, by_step: Mapping[int, list[float]]) ->
             -1, max(episodes, 1)
         ),
         total_steps=max(run.steps, shared.steps),
-        failed_at=run.steps if run.status == FAILED else None,
+        failed_at=run.steps if run.status == files.FAILED else None,
         return_floor=task.return_floor,
         return_ceiling=task.return_ceiling,
         reference=_mean(blind[: shared.final_episodes]),

@@ -12,17 +12,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jbrep.dataset.formats.frame import (
-    CHUNK,
-    ENDS,
-    PEEKED,
-    About,
-    Frame,
-    check_plain,
-    label_of,
-    measured,
-    units_in,
-)
+from jbrep.dataset.formats import frame
+from jbrep.dataset.formats.frame import About, Frame, check_plain, label_of, measured, units_in
 from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line, refusing
@@ -39,7 +30,7 @@ def read(given: str) -> Frame:
     path = Path(given)
     with opened(path) as file:
         rows, metadata = file.metadata.num_rows, file.metadata.metadata or {}
-        schema = measured(file.schema_arrow, next(file.iter_batches(PEEKED), None))
+        schema = measured(file.schema_arrow, next(file.iter_batches(frame.PEEKED), None))
         own = _exported(path, schema, metadata[_SETTINGS]) if _SETTINGS in metadata else {}
     return Frame(
         **{"name": given, "label": label_of(path.stem), "about": units_in(schema), **own},
@@ -65,7 +56,7 @@ def batches_of(paths: list[Path], columns: list[str]) -> Iterator[pa.RecordBatch
     """The rows of some columns, in one file after the other."""
     for path in paths:
         with opened(path) as file:
-            yield from file.iter_batches(CHUNK, columns=columns)
+            yield from file.iter_batches(frame.CHUNK, columns=columns)
 
 
 def _exported(path: Path, schema: pa.Schema, settings: bytes) -> dict[str, Any]:
@@ -81,7 +72,7 @@ def _exported(path: Path, schema: pa.Schema, settings: bytes) -> dict[str, Any]:
     with opened(beside) as file:
         episodes = file.read()
         final = np.stack(episodes["final_observation"].to_numpy()).astype(np.float64)
-        once = {name: episodes[name].to_numpy() for name in ENDS}
+        once = {name: episodes[name].to_numpy() for name in frame.ENDS}
         once["seed"] = np.array(episodes["seed"].to_pylist(), np.int64)
     offsets = zip(task.features, task.offset.tolist(), strict=True)
     return {

@@ -12,23 +12,11 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from jbrep.coordinates import wrapped
+from jbrep.dataset.formats import roles
 from jbrep.dataset.formats.clock import in_parts, same_clock, timestep_of
 from jbrep.dataset.formats.episodes import Counts, Incoming, Rows, cut, episode_of
 from jbrep.dataset.formats.frame import ENDS, Frame, width
-from jbrep.dataset.formats.roles import (
-    DEGREES,
-    MOST_RADIANS,
-    RADIANS,
-    WIDE,
-    Leaf,
-    Turns,
-    action_names_of,
-    check_radians,
-    features_of,
-    is_of_task,
-    roles_of,
-    second_of,
-)
+from jbrep.dataset.formats.roles import DEGREES, MOST_RADIANS, RADIANS, WIDE, Leaf, Turns, second_of
 from jbrep.dataset.layout import Layout
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line, listed, refusing
@@ -62,14 +50,14 @@ class Source:
 
     def __init__(self, frame: Frame, given: Layout | None = None, missing: str = ""):
         self.frame, self._layout = frame, _both(frame, given or Layout())
-        self._roles, rate = roles_of(frame, self._layout), self._layout.rate
+        self._roles, rate = roles.roles_of(frame, self._layout), self._layout.rate
         self._counts, self._others = Counts(), tuple[Source, ...]()
         self.has_changed: Callable[[], bool] = lambda: False
         self._may_miss = (*WIDE, "reward") if missing or rate else ()
         used = [(role, leaf.column) for role, some in self._roles.items() for leaf in some]
         self._columns = list(dict.fromkeys(column for _, column in used))
         self._numeric = {column for role, column in used if role not in _EXACT}
-        seen, is_own = self._roles["observation"], is_of_task(frame, self._roles)
+        seen, is_own = self._roles["observation"], roles.is_of_task(frame, self._roles)
         self._turns = Turns()
         self._angles = np.array([each.is_angle for each in seen])
         degrees = self._angles & np.array([each.unit in DEGREES for each in seen])
@@ -78,8 +66,8 @@ class Source:
         self.task, self.has_rewards = frame.task if is_own else None, "reward" in self._roles
         other = "its columns aren't those of its task"
         self.why_no_task = other if frame.task else frame.why_no_task
-        self.features = () if is_own else features_of(frame.name, seen)
-        self.action_names = action_names_of(self._roles["action"])
+        self.features = () if is_own else roles.features_of(frame.name, seen)
+        self.action_names = roles.action_names_of(self._roles["action"])
         places = [leaf.place or 0 for leaf in self._roles["action"]]
         self.action_bounds = frame.action_bounds and np.array(frame.action_bounds)[:, places]
         self.subtracted = self._factors * [each.subtracted for each in seen]
@@ -154,7 +142,7 @@ class Source:
         if not self._angles.any():
             return seen
         for i in np.flatnonzero(np.fmax.reduce(np.abs(seen), axis=0, initial=0) > MOST_RADIANS):
-            check_radians(self.name, self._roles["observation"][i])
+            roles.check_radians(self.name, self._roles["observation"][i])
         turned = seen * self._factors
         return np.where(self._angles, wrapped(turned), turned)
 
