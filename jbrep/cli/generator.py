@@ -24,7 +24,7 @@ from msgspec import NODEFAULT, Meta
 
 from jbrep.errors import InputError
 from jbrep.records.keys import Key, keys_of, option_name
-from jbrep.records.record import converted, from_text
+from jbrep.records.record import converted, from_text, with_zeros
 
 _Parameter = inspect.Parameter
 _SECTIONS = re.compile(r"\n+(Args|Returns|Raises):\n.*", re.DOTALL)
@@ -342,7 +342,7 @@ def parse_pairs(given: Iterable[str], option: str = "--env") -> dict[str, Any]:
         if not equals or not name.isidentifier() or name in arguments:
             raise InputError(f"{option} {pair} isn't an argument, or repeats one: write NAME=VALUE")
         try:
-            arguments[name] = json.loads(f"0{value}" if value.startswith(".") else value)
+            arguments[name] = json.loads(with_zeros(value))
         except (ValueError, RecursionError):
             arguments[name] = value
     return arguments

@@ -27,8 +27,7 @@ def number_of(value: Any) -> float | None:
 
 def numbers_in(info: Mapping[str, Any]) -> Numbers:
     """The numbers in an environment's `info`, in its order; those with printable names."""
-    named = {n: each for n, each in info.items() if isinstance(n, str) and n.isprintable()}
-    pairs = ((n, number_of(each)) for n, each in named.items() if 0 < len(n) <= _MAX_NAME)
+    pairs = ((name, number_of(value)) for name, value in info.items() if _is_name(name))
     return {name: value for name, value in pairs if value is not None}
 
 
@@ -56,3 +55,7 @@ def shares_text(values: Mapping[str, list[float]]) -> str:
         f"{name} {np.mean(each):.2f} in {counted(len(each), 'episode')}"
         for name, each in shares(values).items()
     )
+
+
+def _is_name(name: Any) -> bool:
+    return isinstance(name, str) and name.isprintable() and 0 < len(name) <= _MAX_NAME

@@ -110,20 +110,20 @@ def _whole(text: str, where: str) -> int:
 def converted(value: Any, kind: Any, where: str, strict: bool = True) -> Any:
     """As `from_plain`, for types that aren't classes; not strict of numbers that are text."""
     try:
-        return msgspec.convert(value if strict else _with_zeros(value), kind, strict=strict)
+        return msgspec.convert(value if strict else with_zeros(value), kind, strict=strict)
     except msgspec.ValidationError as error:
         raise InputError(_line(str(error), value, kind, where)) from None
     except RecursionError:
         raise InputError(f"{where or 'it'} must be nested less deeply") from None
 
 
-def _with_zeros(value: Any) -> Any:
+def with_zeros(value: Any) -> Any:
     """Numbers such as -.5 in text, lists and tables as -0.5, which msgspec takes."""
     if isinstance(value, str):
         return _FRACTION.sub(r"\g<1>0\2", value)
     if isinstance(value, Mapping):
-        return {name: _with_zeros(each) for name, each in value.items()}
-    return [*map(_with_zeros, value)] if isinstance(value, list | tuple) else value
+        return {name: with_zeros(each) for name, each in value.items()}
+    return [*map(with_zeros, value)] if isinstance(value, list | tuple) else value
 
 
 def _line(message: str, value: Any, kind: Any, where: str) -> str:

@@ -73,9 +73,9 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
         if not all(_key(row) in known for row in used):
             raise
     text = diagnostics_text([r._replace(values=known[_key(r)]) for r in used if _key(r) in known])
-    is_new = record.tables.get(DIAGNOSTICS) != hashlib.sha256(text.encode()).hexdigest()
-    if is_new or not exists(folder / DIAGNOSTICS):
-        sha256 = write_text(folder / DIAGNOSTICS, text)
+    sha256 = hashlib.sha256(text.encode()).hexdigest()
+    if record.tables.get(DIAGNOSTICS) != sha256 or not exists(folder / DIAGNOSTICS):
+        write_text(folder / DIAGNOSTICS, text)
         record.with_table(DIAGNOSTICS, sha256).write(folder / RECORD)
     return list(_unknown(used, known))
 

@@ -138,10 +138,15 @@ def _excess(curves: Curves, log_ratio: float) -> float:
     return float(log_spread(x.T, *how) - log_spread(y.T, *how))
 
 
+def swaps(units: int, count: int, seed: int) -> NDArray[np.bool_]:
+    """Which units swap sides in each permutation, (count, units)."""
+    return np.random.default_rng(seed).random((count, units)) < 0.5
+
+
 def _permuted(curves: Curves, count: int, seed: int) -> NDArray[np.int64]:
     """Orders of all curves, (count, 2 n), in which units may have swapped sides."""
     runs, every = len(curves.x), np.arange(2 * len(curves.x))
-    swapped = np.tile(np.random.default_rng(seed).random((count, runs)) < 0.5, 2)
+    swapped = np.tile(swaps(runs, count, seed), 2)
     return np.where(swapped, (every + runs) % (2 * runs), every)
 
 

@@ -118,9 +118,10 @@ def with_failure_returns(runs: Sequence[RunCurve]) -> list[RunCurve]:
     worst: dict[Key, float] = {}
     for run in runs:
         every = np.concatenate([*run.evaluations, [np.inf]])
-        blind = (run.reference, run.reference_in_training) if len(run.steps) else ()
-        seen = min([every.min(), *(each for each in blind if each is not None)])
-        seen = seen if run.return_floor is None else run.return_floor
+        seen = run.return_floor
+        if seen is None:
+            blind = (run.reference, run.reference_in_training) if len(run.steps) else ()
+            seen = min([every.min(), *(each for each in blind if each is not None)])
         key = run.task, run.algorithm
         worst[key] = min(worst.get(key, np.inf), float(seen))
     known = {key: value for key, value in worst.items() if np.isfinite(value)}

@@ -1,4 +1,4 @@
-"""What readers of the code broke: each is a line, or works."""
+"""Regressions: what once failed is refused in a line, or works."""
 
 import json
 import subprocess
@@ -52,7 +52,7 @@ class Slow(gymnasium.Env):
         return np.full(2, reading), float(action[0]), False, False, {}
 
 
-gymnasium.register("SecondReading/Slow-v0", Slow, max_episode_steps=5)
+gymnasium.register("Regressions/Slow-v0", Slow, max_episode_steps=5)
 
 
 @pytest.mark.parametrize("kind", ["features", "preset"])
@@ -72,7 +72,7 @@ def test_a_stranger_s_study_reads_no_other_file(kind, tmp_path):
 
 def test_the_time_of_a_step_is_that_of_each_robot(monkeypatch):
     monkeypatch.setenv(STEP_TIMEOUT, "0.1")
-    envs = Environments(describe("SecondReading/Slow-v0"), 6)
+    envs = Environments(describe("Regressions/Slow-v0"), 6)
     envs.reset([*range(6)], [*range(6)])
     assert not envs.step(np.zeros((6, 1), np.float32)).truncated.any()
 
@@ -174,7 +174,7 @@ def test_a_claim_may_be_tested_at_levels_that_others_pass_on():
 
 
 def test_a_lost_step_has_the_reward_before_it():
-    envs = AutoresetEnvironments(describe("SecondReading/Slow-v0", missing="skip"), 1)
+    envs = AutoresetEnvironments(describe("Regressions/Slow-v0", missing="skip"), 1)
     envs.reset([0])
     steps = [envs.step(np.full((1, 1), each)) for each in (0.5, -0.5, 0.7)]
     assert [each.reward.item() for each in steps] == [0.5, -0.5, -0.5]
@@ -219,12 +219,12 @@ class Robot(gymnasium.Env):
         return np.float32([1, 2]) + action, 0.5, False, False, {}
 
 
-gymnasium.register("SecondReading/Robot-v0", Robot, max_episode_steps=5)
+gymnasium.register("Regressions/Robot-v0", Robot, max_episode_steps=5)
 
 
 def named(*names):
     rows = [{"name": name, "unit": name} for name in names]
-    return describe("SecondReading/Robot-v0", features={"features": rows})
+    return describe("Regressions/Robot-v0", features={"features": rows})
 
 
 def test_a_clone_is_played_by_one_robot_and_kept_where_that_fails(tmp_path, monkeypatch):
@@ -319,9 +319,9 @@ def test_columns_of_another_order_and_odd_episodes_are_refused(tmp_path):
 def test_numbers_that_begin_with_a_point_and_offsets_that_stay():
     domain = describe("face_direction", domain={"noise": ".1", "mass": ".5..1.5"}).domain
     assert (domain.noise, domain.mass) == ((0.1, 0.1), (0.5, 1.5))
-    assert describe("SecondReading/Robot-v0", action_bounds="-.5...5").action_low == (-0.5,)
+    assert describe("Regressions/Robot-v0", action_bounds="-.5...5").action_low == (-0.5,)
     rows = [{"name": "a", "offset": 5.0, "low": -1.0}, {"name": "b"}]
-    task = describe("SecondReading/Robot-v0", features={"features": rows})
+    task = describe("Regressions/Robot-v0", features={"features": rows})
     again = with_features(task, {"features": [{"name": "c"}, {"offset": 1.0}]})
     assert again.offsets == {"c": 5.0, "b": 1.0}
 
