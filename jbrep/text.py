@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain, count
 from typing import NamedTuple, TypeVar
 
-SIGNIFICANT = ",.3g"  # a format for `number`: three digits
+SIGNIFICANT = ",.3g"  # three digits
 _GAP = "  "  # between columns
 _NUMBER = re.compile(r"[<>]? ?-?[\d,]*\.?\d+(e[-+]?\d+)?( \[.*\]| \(\d+/\d+\))?")
 _COLUMN = re.compile(r"(step|action|reward)(_\d+)?")
@@ -128,7 +128,7 @@ def facts(named: Mapping[str, str], width: int | None, indent: int = 2) -> str:
     )
 
 
-def interval(values: Sequence[float | None], form: str) -> str:
+def interval(values: Sequence[float | None], form: str = SIGNIFICANT) -> str:
     """A value with its interval, if it has one: 1.08 [1.07, 1.09], or 1.08 [1.07, unbounded]."""
     value, *ends = values
     shown = number(value, form)
@@ -138,7 +138,7 @@ def interval(values: Sequence[float | None], form: str) -> str:
     return f"{shown} [{low}, {high}]"
 
 
-def number(value: float | None, form: str) -> str:
+def number(value: float | None, form: str = SIGNIFICANT) -> str:
     """A number in that format, or a dash for None."""
     if value is None:
         return "-"

@@ -49,10 +49,6 @@ def plots(found):
     return {plot.name: plot for plot in study_plots(found)}
 
 
-def panels_of(figure):
-    return {axes.get_title(loc="left"): axes for axes in figure.axes}
-
-
 def test_each_figure_is_written_as_pdf_and_png_beside_its_table(found, tmp_path):
     one = found.replace(groups=found.groups[:1], aggregates=[], runs=found.runs[:4])
     plots = {plot.name: plot for plot in study_plots(one)}
@@ -74,7 +70,8 @@ def test_each_figure_is_written_as_pdf_and_png_beside_its_table(found, tmp_path)
 def test_curves_are_the_means_of_the_statistics(plots, found):
     group = found.groups[1]
     assert (group.task, group.algorithm) == GROUPS[1]
-    axes = panels_of(drawn(plots["representations"]))["face_direction,\nsac"]
+    panels = {axes.get_title(loc="left"): axes for axes in drawn(plots["representations"]).axes}
+    axes = panels["face_direction,\nsac"]
     lines = {line.get_label(): line for line in axes.lines}
     curves = [line.get_ydata() for line in axes.lines if len(line.get_xdata()) > 2]
     for agents, curve in zip(group.agents, curves, strict=False):

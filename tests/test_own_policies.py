@@ -62,10 +62,6 @@ def broken(observation):
     return np.zeros(2)
 
 
-def raising(observation):
-    raise KeyError("sensor")
-
-
 def actions(policy, tmp_path, **how):
     data = package.collect(PENDULUM, tmp_path / "data", steps=60, policy=policy, **how)
     return data["action"][:].reshape(-1, 20), data
@@ -120,7 +116,9 @@ def test_only_the_same_code_continues_a_data_set(tmp_path, monkeypatch):
         assert find_policy(there, tmp_path, PENDULUM).settings() == first
 
 
-@pytest.mark.parametrize("policy", [broken, raising, "uniform:x", 3.0, lambda seen: [np.nan]])
+@pytest.mark.parametrize(
+    "policy", [broken, lambda seen: {}["sensor"], "uniform:x", 3.0, lambda seen: [np.nan]]
+)
 def test_what_cannot_act_is_refused(policy, tmp_path):
     with pytest.raises(InputError):
         package.collect(PENDULUM, tmp_path / "data", steps=20, policy=policy)

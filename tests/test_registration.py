@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -16,14 +17,15 @@ from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import read_manifest, write_manifest
 from jbrep.encoders import find, load, save
 from jbrep.envs import describe
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError
 from jbrep.records import commit as of_git
 from jbrep.records.document import read_document
 from jbrep.rl.files import RUN, read_run, runs_below
 from jbrep.rl.policy_file import shipped_file
+from jbrep.stats.rules import Rules
 from jbrep.studies.config import Data, read_study
 from jbrep.studies.plan import REGISTRATION, Plan, find_committed, registration_in, seal
-from jbrep.studies.prepare import prepare
+from jbrep.studies.prepare import check, prepare
 from jbrep.studies.record import RECORD, RunsRecord
 from jbrep.studies.runner import register_study, run_study
 from jbrep.studies.tables import write_tables
@@ -134,14 +136,26 @@ def test_other_policies_and_data_than_were_registered_are_told(collected, tmp_pa
     assert plan.policies == plan.registration.policies
     assert plan.deviations([]) == []
     plan.registration = plan.registration.replace(policies={name: "0" * 64})
-    assert plan.deviations([]) == [f"other policies than were registered collected data: {name}"]
+    assert plan.deviations([]) == [f"policies are others than were registered: {name}"]
     there = Plan(TINIER.replace(data={"": Data(folder=str(collected))}), tmp_path / "there")
     with of_a_commit():
         register_study(there)
     assert there.deviations([]) == []
-    there.registration = there.registration.replace(data={str(collected): "0" * 64})
-    (told,) = there.deviations([])
-    assert str(collected) in told
+    there.registration = there.registration.replace(data={str(collected): "0" * 64, "gone": "0"})
+    other, missing = there.deviations([])
+    assert (str(collected) in other, "gone" in missing) == (True, True)
+
+
+def test_the_policy_that_scores_1_is_checked_and_registered(tmp_path):
+    path = shutil.copy(shipped_file("face_direction"), tmp_path / "good.safetensors")
+    plan = Plan(TINIER.replace(verdicts=Rules(reference=str(path))), tmp_path / "study")
+    with of_a_commit():
+        register_study(plan)
+    path.write_bytes(shipped_file("move_to_pose").read_bytes())
+    assert plan.deviations([]) == [f"policies are others than were registered: {path}"]
+    for wrong in (str(path), "no-such-run"):
+        with pytest.raises(InputError, match=r"verdicts\.reference can't play face_direction"):
+            check(Plan(TINIER.replace(verdicts=Rules(reference=wrong)), tmp_path / "other"))
 
 
 def test_claims_in_a_work_tree_run_once_they_are_committed(repository, tmp_path, monkeypatch):
@@ -290,7 +304,8 @@ def test_a_study_with_claims_is_registered_when_it_begins(tmp_path):
     (run,) = runs_below(again.folder)
     assert read_run(run).settings.registration == again.registration.sha256
     (again.folder / REGISTRATION).unlink()
-    assert Plan(CLAIMS, again.folder).registration is None
+    with pytest.raises(DamageError, match=f"{REGISTRATION} is missing"):
+        write_tables(again.folder)
 
 
 HEAD = "0123456789" * 4

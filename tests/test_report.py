@@ -328,7 +328,7 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
     policies |= {"random": "uniform", "scripted": "heuristic"}
     episodes = study.final_episodes
     assert [row[1] for row in rows[1:]] == [name for name in policies for _ in range(episodes)]
-    task = plan.task("face_direction")
+    task = plan.study.task("face_direction")
     for _, name, episode, played in rows[1:]:
         alone = find_episode(policies[name], int(episode), task).reward.sum()
         assert float(played) == pytest.approx(alone, abs=1e-3)
@@ -426,6 +426,21 @@ def test_references_of_an_environment_that_is_not_here_stay(tmp_path, monkeypatc
     with pytest.warns(Notice, match="couldn't be played on face_direction: it isn't here"):
         play_references(plan.folder)
     assert read_tables(plan.folder).raw.references == before
+
+
+def test_what_a_report_writes_while_references_are_played_stays(tmp_path, monkeypatch):
+    plan = make_study(tmp_path / "it")
+    write_tables(plan.folder)
+
+    def meanwhile(policy, task, episodes):
+        record = read_document(plan.folder / RECORD, RunsRecord)
+        record.with_table("more.csv", "0" * 64).write(plan.folder / RECORD)
+        return [1.0] * episodes
+
+    monkeypatch.setattr("jbrep.studies.tables.play", meanwhile)
+    play_references(plan.folder)
+    tables = read_document(plan.folder / RECORD, RunsRecord).tables
+    assert tables.keys() >= {REFERENCE_RETURNS, "more.csv"}
 
 
 ROWS = [

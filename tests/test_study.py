@@ -217,7 +217,7 @@ def test_it_makes_data_and_encoders(tmp_path):
     prints = set()
     for cell in plan.cells:
         encoder = load(Path(plan.run(cell).encoder))
-        assert encoder.task == plan.task(cell.task)
+        assert encoder.task == plan.study.task(cell.task)
         assert encoder.header.data["seed"] == 5
         prints.add((cell.task, encoder.header.data["fingerprint"]))
         plan.run(cell).check()

@@ -25,11 +25,6 @@ from jbrep.studies.tables import REFERENCE_RETURNS, play_references, write_table
 DOCS = Path(__file__).parent.parent / "docs" / "verdicts.md"
 
 
-def in_no_time(policy, task, episodes):
-    """What other policies might return."""
-    return [950.0 if policy == "scripted" else STILL] * episodes
-
-
 @pytest.fixture(scope="module")
 def reports(tmp_path_factory):
     """The reports of a study after half and all of its seeds, and after more were added."""
@@ -39,7 +34,8 @@ def reports(tmp_path_factory):
     found = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "study_plots", lambda found: [])
-        patch.setattr("jbrep.studies.tables.play", in_no_time)
+        returns = {"scripted": 950.0}
+        patch.setattr("jbrep.studies.tables.play", lambda p, _, n: [returns.get(p, STILL)] * n)
         for seeds in (8, SEEDS, SEEDS + 2):
             plan = Plan(STUDY.replace(seeds=tuple(range(max(seeds, SEEDS)))), folder)
             plan.write()

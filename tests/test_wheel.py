@@ -1,6 +1,5 @@
 """What is installed without the repository."""
 
-import re
 import subprocess
 import sys
 import tomllib
@@ -25,24 +24,15 @@ def test_a_wheel_has_every_file_of_the_package(tmp_path):
     packed = {name for name in archive.namelist() if name.startswith("jbrep/")}
     assert packed == wanted
     assert "jbrep/py.typed" in packed
-    check_metadata(archive)
-
-
-def check_metadata(archive):
-    """What an index of packages shows, and what pip goes by."""
     (path,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
     said = message_from_bytes(archive.read(path))
     given = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     for key in ("name", "version", "author", "license-expression", "description-content-type"):
         assert said[key], key
     assert (said["name"], said["requires-python"]) == ("jbrep", given["requires-python"])
-    assert said["version"] == cff_version()
+    assert said["version"] == given["version"]
     assert said.get_payload(decode=True).decode() == (ROOT / "README.md").read_text()
     assert set(said.get_all("provides-extra")) == given["optional-dependencies"].keys()
     assert "Typing :: Typed" in said.get_all("classifier")
     (commands,) = (name for name in archive.namelist() if name.endswith("entry_points.txt"))
     assert b"jbrep = jbrep.cli:main" in archive.read(commands)
-
-
-def cff_version():
-    return re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.M)[1]

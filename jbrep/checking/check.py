@@ -16,16 +16,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within
-from jbrep.text import (
-    SIGNIFICANT,
-    Table,
-    counted,
-    duration,
-    facts,
-    interval,
-    terminal_width,
-    wrapped,
-)
+from jbrep.text import Table, counted, duration, facts, interval, terminal_width, wrapped
 
 _NOT_PLAYED = (
     "not asked of data: what simple policies return, how long actions must be held, whether it is "
@@ -117,8 +108,7 @@ class Check(NamedTuple):
         limit, whole = (self.played.limit if self.played else 0), self.seen.task.max_episode_steps
         cut = f" in {limit} steps" if limit < whole else ""
         rows = [
-            (name, interval(ends, SIGNIFICANT), f"{count:,}")
-            for name, (*ends, count) in self.returns.items()
+            (name, interval(ends), f"{count:,}") for name, (*ends, count) in self.returns.items()
         ]
         return Table("", (f"return{cut} of", "mean [95 % interval]", "episodes"), rows)
 

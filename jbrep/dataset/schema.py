@@ -10,15 +10,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
-from jbrep.dataset.settings import (
-    IMPORTED,
-    MAX_LETTERS,
-    MIXTURE,
-    TRAINED,
-    CollectSettings,
-    PolicySettings,
-    parts_of,
-)
+from jbrep.dataset import settings
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, refusing
 from jbrep.records.record import pattern, to_plain
@@ -35,7 +27,7 @@ _Code = Annotated[
     pattern(
         r"(?a)\A[\w.]+:[\w.]+ [0-9a-f]{12}\Z",
         "module:function and the first 12 digits of its hash",
-        max_length=MAX_LETTERS,
+        max_length=settings.MAX_LETTERS,
     ),
 ]
 
@@ -52,18 +44,18 @@ def _spec(dtype: str, *row: int, follows: Callable[[Columns], NDArray[Any]] | No
     return Spec(np.dtype(dtype), row, follows)
 
 
-class DataSettings(CollectSettings, frozen=True, kw_only=True):
+class DataSettings(settings.CollectSettings, frozen=True, kw_only=True):
     """What determines the data, and how they are divided into shards."""
 
     task: Task = msgspec.field(name="environment")
-    policy: PolicySettings = msgspec.field(default_factory=lambda: {"kind": "uniform"})
+    policy: settings.PolicySettings = msgspec.field(default_factory=lambda: {"kind": "uniform"})
     unrewarded: Literal[True] | UnsetType = UNSET  # imported data that have no rewards
     reward: _Code | UnsetType = UNSET  # what has given the rewards, if not the environment
 
     def check(self) -> None:
         with refusing("the policy lacks a setting", (LookupError, TypeError, ValueError)):
-            for policy in parts_of(self.policy):
-                if policy["kind"] == TRAINED:
+            for policy in settings.parts_of(self.policy):
+                if policy["kind"] == settings.TRAINED:
                     itemgetter("file", "sha256", "run", "step")(policy)
         self.specs()
         episode_seed(self.task, self.seed, (self.steps - 1) // self.task.max_episode_steps)
@@ -84,13 +76,13 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
     @property
     def weights(self) -> list[float]:
         """The weights of a mixture's parts; of another policy, none."""
-        parts = self.policy["parts"] if self.policy["kind"] == MIXTURE else ()
+        parts = self.policy["parts"] if self.policy["kind"] == settings.MIXTURE else ()
         return [weight for weight, _ in parts]
 
     @property
     def is_imported(self) -> bool:
         """Whether the data were made elsewhere: no episode can be simulated again."""
-        return bool(self.policy["kind"] == IMPORTED)
+        return bool(self.policy["kind"] == settings.IMPORTED)
 
     def specs(self) -> dict[str, Spec]:
         """The columns of each shard, by their paths in the file."""

@@ -133,13 +133,5 @@ def move_to_pose(
     return np.where(_distance(state) > approach.there, go, face)
 
 
-HEURISTICS: dict[str, Callable[..., Array]] = {
-    policy.__name__: policy
-    for policy in (
-        move_from_origin,
-        face_direction,
-        move_in_direction,
-        move_to_position,
-        move_to_pose,
-    )
-}
+_ALL = move_from_origin, face_direction, move_in_direction, move_to_position, move_to_pose
+HEURISTICS: dict[str, Callable[..., Array]] = {policy.__name__: policy for policy in _ALL}

@@ -14,17 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from jbrep.envs.environments import check_counts
 from jbrep.envs.physics import put_factors, turned, turned_quaternion, velocity_after
 from jbrep.envs.task import Array
-from jbrep.jitterbug import bodies
-from jbrep.jitterbug.tasks import (
-    CONTROL_TIMESTEP,
-    QUATERNION,
-    JitterbugTask,
-    Readings,
-    yaw_direction,
-)
+from jbrep.jitterbug import bodies, tasks
 
 PHYSICS_TIMESTEP = 0.0002  # [s]
-PHYSICS_STEPS = round(CONTROL_TIMESTEP / PHYSICS_TIMESTEP)  # in a control step
+PHYSICS_STEPS = round(tasks.CONTROL_TIMESTEP / PHYSICS_TIMESTEP)  # in a control step
 _ARENA = 1 << 20  # [bytes] per robot; MuJoCo's own choice is 14 times as large
 _UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -100,7 +93,7 @@ class Simulation:
 
     def __init__(
         self,
-        task: JitterbugTask,
+        task: tasks.JitterbugTask,
         num_envs: int,
         num_threads: int | None = None,
         body: int | str | None = None,
@@ -133,7 +126,7 @@ class Simulation:
         )
         self.target_quaternion = self._batch.bind("mocap_quat")[:, 0]
         self._warmstart = self._batch.bind("qacc_warmstart")
-        self.readings = Readings(*self._views)
+        self.readings = tasks.Readings(*self._views)
 
     def reset(
         self,
@@ -154,7 +147,7 @@ class Simulation:
         self._batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE)
         for index, random in zip(indices, randoms, strict=True):
             start = self.task.start(random)
-            self.readings.qpos[index, QUATERNION] = start.quaternion
+            self.readings.qpos[index, tasks.QUATERNION] = start.quaternion
             self.readings.target_position[index] = start.target_position
             self.target_quaternion[index] = start.target_quaternion
         self._forward(indices)
@@ -226,7 +219,7 @@ class Simulation:
             state[name][:, :2] = turned(state[name][:, :2]) + shift
         for name in ("qvel", "warmstart"):
             state[name][:, :2] = turned(state[name][:, :2])
-        for quaternion in (state["qpos"][:, QUATERNION], state["target_quaternion"]):
+        for quaternion in (state["qpos"][:, tasks.QUATERNION], state["target_quaternion"]):
             quaternion[:] = turned_quaternion(quaternion)
         self.restore(**state)
 
@@ -268,9 +261,9 @@ class Simulation:
         self._forward(indices)
 
     def _forward(self, indices: Sequence[int]) -> None:
-        self.readings.target_axis[:] = yaw_direction(self.target_quaternion)
+        self.readings.target_axis[:] = tasks.yaw_direction(self.target_quaternion)
         self._batch.forward(indices, stage=_UP_TO_VELOCITIES)
-        self.readings = Readings(*self._views)
+        self.readings = tasks.Readings(*self._views)
 
     def step(self, action: Array) -> NDArray[np.bool_]:
         """Hold the actions (n, 1) for a control step; whether each robot has diverged so far, (n,).
@@ -279,7 +272,7 @@ class Simulation:
         """
         self._control[:] = action
         self._batch.step(nstep=PHYSICS_STEPS, stage=_UP_TO_VELOCITIES)
-        self.readings = Readings(*self._views)
+        self.readings = tasks.Readings(*self._views)
         return self._warnings.any(axis=1)
 
     def observe(self) -> Array:

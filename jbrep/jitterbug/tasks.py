@@ -292,41 +292,35 @@ class JitterbugTask:
         )
 
 
-TASKS = {
-    task.name: task
-    for task in (
-        JitterbugTask("move_from_origin", "easy", (_position("offset"), *_MOTION), (away_term,)),
-        JitterbugTask(
-            "face_direction",
-            "easy",
-            (*_SHARED, _ANGLE_TO_TARGET),
-            (heading_term,),
-            target_yaw=_TURN,
-        ),
-        JitterbugTask(
-            "move_in_direction",
-            "easy",
-            (*_SHARED, _ANGLE_TO_TARGET, _TARGET_VELOCITY),
-            (velocity_term,),
-            target_yaw=_TURN,
-        ),
-        JitterbugTask(
-            "move_to_position",
-            "hard",
-            (*_SHARED, _TARGET_POSITION),
-            (position_term,),
-            target_radius=_TARGET_RADIUS,
-        ),
-        JitterbugTask(
-            "move_to_pose",
-            "hard",
-            (*_SHARED, _TARGET_POSITION, _ANGLE_TO_TARGET),
-            (position_term, heading_term),
-            target_radius=_TARGET_RADIUS,
-            target_yaw=_TURN,
-        ),
-    )
-}
+_ALL = (
+    JitterbugTask("move_from_origin", "easy", (_position("offset"), *_MOTION), (away_term,)),
+    JitterbugTask(
+        "face_direction", "easy", (*_SHARED, _ANGLE_TO_TARGET), (heading_term,), target_yaw=_TURN
+    ),
+    JitterbugTask(
+        "move_in_direction",
+        "easy",
+        (*_SHARED, _ANGLE_TO_TARGET, _TARGET_VELOCITY),
+        (velocity_term,),
+        target_yaw=_TURN,
+    ),
+    JitterbugTask(
+        "move_to_position",
+        "hard",
+        (*_SHARED, _TARGET_POSITION),
+        (position_term,),
+        target_radius=_TARGET_RADIUS,
+    ),
+    JitterbugTask(
+        "move_to_pose",
+        "hard",
+        (*_SHARED, _TARGET_POSITION, _ANGLE_TO_TARGET),
+        (position_term, heading_term),
+        target_radius=_TARGET_RADIUS,
+        target_yaw=_TURN,
+    ),
+)
+TASKS = {task.name: task for task in _ALL}
 
 
 def get_task(name: str) -> JitterbugTask:

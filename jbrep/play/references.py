@@ -13,7 +13,7 @@ from jbrep.records.tables import rounded as as_in_tables
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within
 from jbrep.stats.labels import NO, UNCLEAR, YES, learnt
 from jbrep.stats.scale import CONSTANT, LOOKING, RANDOM, STILL, best_blind
-from jbrep.text import SIGNIFICANT, counted, interval, rounded
+from jbrep.text import counted, interval, rounded
 
 _POLICIES = {
     STILL: "still",
@@ -62,7 +62,7 @@ class Beside(NamedTuple):
 def mean_text(task: Task, returns: Sequence[float] | Array) -> str:
     """The mean of returns with its interval: 31.9 [28.1, 35.7], mean and 95 % interval of 50 ..."""
     bounds = Bounds.of(task.return_floor, task.return_ceiling)
-    mean = interval(mean_within(np.asarray(returns), bounds, LEVEL).tolist(), SIGNIFICANT)
+    mean = interval(mean_within(np.asarray(returns), bounds, LEVEL).tolist())
     return f"{mean}, mean and 95 % interval of {counted(len(returns), 'episode')}"
 
 

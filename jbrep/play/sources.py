@@ -177,6 +177,14 @@ def run_folder(source: str) -> Path | None:
     return folder if source != SHIPPED and is_run(folder) else None
 
 
+def frozen_file(source: str) -> Path | None:
+    """The file that holds the policy a source names; None of one by name or code, or that ships."""
+    if (folder := run_folder(source)) and exists(folder / POLICY):
+        return folder / POLICY
+    path = Path(source)
+    return path if is_exported(source) or is_policy_file(path) else None
+
+
 def _trained(source: str, task: Task | None, encoder: Any) -> Player:
     from jbrep.rl.policy import (
         load_run,  # imports torch

@@ -7,7 +7,7 @@ from jbrep.encoders import FULL
 from jbrep.evaluation.diagnosis import SCALARS
 from jbrep.evaluation.evaluation import Diagnostics, Evaluation, Lost, Score
 from jbrep.reporting.views import say
-from jbrep.text import SIGNIFICANT, Table, facts, number, r2_text, wrapped
+from jbrep.text import Table, facts, number, r2_text, wrapped
 
 _MEASURES = {  # the first that the full observation predicts decides
     "rewarded": "the change of what the reward depends on",
@@ -148,7 +148,7 @@ def missed(evaluation: Evaluation) -> dict[str, list[Lost]]:
 def _everything(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
     others = [name for name, scalar in SCALARS.items() if not scalar.is_first]
     rows = [
-        (label, *(number(_score(known, name).value, SIGNIFICANT) for name in others))
+        (label, *(number(_score(known, name).value) for name in others))
         for label, known in evaluation.encoders.items()
     ]
     yield Table("All other diagnostics", ("encoder", *others), rows)

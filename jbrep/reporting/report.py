@@ -12,19 +12,18 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from jbrep.progress import Progress
-from jbrep.records.storage import exclusive, make_folder, write_whole
+from jbrep.records.storage import make_folder, write_whole
 from jbrep.reporting import views
 from jbrep.reporting.diagnostics import add_diagnostics
 from jbrep.reporting.figures import Plot, study_plots, write
 from jbrep.reporting.figures.panels import PAGE as WHOLE
 from jbrep.reporting.findings import Findings
 from jbrep.reporting.tables import Tables, read_tables
-from jbrep.studies.tables import Return, check_tables, has_runs, write_tables
+from jbrep.studies.tables import Return, check_tables, has_runs, write_tables, writing
 from jbrep.text import terminal_width
 
 FINDINGS, PAGE, MARKDOWN, FIGURES = "findings.json", "report.html", "summary.md", "figures"
 _MAIN_FIGURE = "final_return.png"
-_MOST_SECONDS = 600.0  # to wait for another process's report
 _WIDEST = 1000  # of a figure on the page [CSS pixels]
 _PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size on paper
 
@@ -67,7 +66,7 @@ def make_report(folder: Path, out: Path | None = None, evaluations: Sequence[str
     written = [folder, out] if ran or evaluations else [out]
     with ExitStack() as stack:
         for each in sorted({each.resolve() for each in written}):
-            stack.enter_context(exclusive(each / PAGE, beside=True, wait=_MOST_SECONDS))
+            stack.enter_context(writing(each))
         if ran:
             write_tables(folder)
         notes = add_diagnostics(folder, evaluations)

@@ -50,7 +50,7 @@ def _environment(is_page: bool) -> Environment:
         lstrip_blocks=True,
     )
     found.filters |= {
-        "number": lambda value, form=SIGNIFICANT: number(value, form),
+        "number": number,
         "markdown": lambda part: markdown(part) if isinstance(part, Table) else escape(part),
         "text": in_text,
     }
@@ -169,11 +169,11 @@ def verdict_cells(verdict: Verdict) -> dict[str, str]:
     return {
         "claim": verdict.sentence,
         "verdict": say("verdict", verdict),
-        "estimate": interval(tested, SIGNIFICANT),
+        "estimate": interval(tested),
         "score": interval(score, ".2f"),
         "why": verdict.reason or "-",
         "level": "-" if verdict.level is None else _level(verdict.level),
-        "boundary": number(verdict.boundary, SIGNIFICANT),
+        "boundary": number(verdict.boundary),
         "p": probability(verdict.p),
         "units": f"{verdict.units} {'encoders' if verdict.by_encoder else 'runs'}",
     }

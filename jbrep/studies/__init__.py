@@ -4,15 +4,5 @@ from jbrep.stats.rules import Rules
 from jbrep.studies.config import Data, Study, read_study
 from jbrep.studies.plan import Plan
 from jbrep.studies.runner import register_study, run_study
-from jbrep.studies.tables import write_tables
 
-__all__ = [
-    "Data",
-    "Plan",
-    "Rules",
-    "Study",
-    "read_study",
-    "register_study",
-    "run_study",
-    "write_tables",
-]
+__all__ = ["Data", "Plan", "Rules", "Study", "read_study", "register_study", "run_study"]

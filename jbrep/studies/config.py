@@ -344,11 +344,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 raise InputError(f"verdicts: no outcome could support {str(claim)!r}: {reason}")
 
     @property
-    def has_claims(self) -> bool:
-        """Whether it claims something, so that it is registered before its first run."""
-        return bool(self.verdicts.claims)
-
-    @property
     def baseline(self) -> str:
         """The representation that the others are compared with."""
         return self.verdicts.baseline_of(each.name for each in self.observed)
@@ -414,7 +409,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             lines.append("This study compares nothing: it has one representation.")
         elif len(self.seeds) == 1:
             lines.append("This study compares nothing: it has one seed.")
-        elif not self.has_claims:
+        elif not self.verdicts.claims:
             lines.append(
                 "This study is exploratory: its report will give no verdicts, as its file has no "
                 "verdicts.claims."

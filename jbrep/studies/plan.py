@@ -15,8 +15,8 @@ from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.envs.names import environment_versions
-from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, differences
+from jbrep.play.sources import frozen_file
 from jbrep.records.commit import CHANGES, commits, in_work_tree, is_committed
 from jbrep.records.document import Document, document_from, parse_json, read_document
 from jbrep.records.record import Version, from_plain, to_plain
@@ -34,15 +34,8 @@ STUDY = "study.json"
 REGISTRATION = "registration.json"
 PROGRESS = "progress"  # of a run under way: its steps
 _SEAL = "sha256"
-_GRID = (  # may change
-    "tasks",
-    "algorithms",
-    "representations",
-    "seeds",
-    "evaluate",
-    "evaluations",
-    "title",
-)
+# may change
+_GRID = "tasks", "algorithms", "representations", "seeds", "evaluate", "evaluations", "title"
 _GRID_TABLES = "algorithms.", "data.", "tasks."
 
 
@@ -54,7 +47,7 @@ class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
 
     study: dict[str, Any]  # as it was written
     encoders: dict[str, str]  # SHA-256 of those that are there beforehand, by the name of the run
-    policies: dict[str, str] = {}  # SHA-256 of those that collect data, by file, see `Plan`
+    policies: dict[str, str] = {}  # SHA-256 by file, see `Plan`
     data: dict[str, str] = {}  # fingerprints of those that are there beforehand, by folder
     date: str  # ISO 8601, in UTC
     versions: dict[Version, Version]  # by package
@@ -95,7 +88,7 @@ class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
         Args:
             study: its settings now.
             runs: all that have ended.
-            policies: SHA-256 of those that collected data, by file.
+            policies: SHA-256 of those that collected data or score 1, by file.
             data: fingerprints of those that the study doesn't make, by folder.
         """
         found = [] if self.committed else ["its registration is in no commit"]
@@ -110,12 +103,14 @@ class Registration(Document, frozen=True, kw_only=True, omit_defaults=True):
             found.append(f"{len(other)} of its runs have other encoders than were registered")
         for name, version in self.versions.items():  # some are of one task's environment alone
             if others := {run.versions.get(name, version) for run in runs} - {version}:
-                found.append(f"{name} was {_listed(sorted(others))}, not {version}")
+                found.append(f"{name} was {_listed(others)}, not {version}")
         found += self._other_code({run.commits.get("jbrep") for run in runs})
         if other := _others(policies, self.policies):
-            found.append(f"other policies than were registered collected data: {_listed(other)}")
+            found.append(f"policies are others than were registered: {_listed(other)}")
         if other := _others(data, self.data):
             found.append(f"data are others than were registered: {_listed(other)}")
+        if gone := self.data.keys() - data.keys():
+            found.append(f"data aren't there to be compared with those registered: {_listed(gone)}")
         return found
 
     def _other_code(self, ran: Set[str | None]) -> list[str]:
@@ -166,7 +161,7 @@ def beside(file: Path) -> Path:
 def find_committed(file: Path, study: Study) -> Registration | None:
     """The registration beside a study's file; None where there is none and needs to be none."""
     path, in_git = beside(file), in_work_tree(file)
-    if not exists(path) and not (in_git and study.has_claims):
+    if not exists(path) and not (in_git and study.verdicts.claims):
         return None
     if in_git and not is_committed(path):
         state = "isn't as in the last commit" if exists(path) else "is missing"
@@ -182,8 +177,8 @@ def find_committed(file: Path, study: Study) -> Registration | None:
     return found
 
 
-def _listed(values: Iterable[object]) -> str:
-    return ", ".join(map(str, values))
+def _listed(values: Iterable[Any]) -> str:
+    return ", ".join(map(str, sorted(values)))
 
 
 class Assigned(NamedTuple):
@@ -267,15 +262,11 @@ class Plan:
         """The runs that have neither finished nor failed."""
         return [cell for cell in self.cells if not exists(self.folder_of(cell) / RUN)]
 
-    def task(self, name: str) -> Task:
-        """A task as the study describes it."""
-        return self.study.task(name)
-
     def run(self, cell: Cell) -> Run:
         """What to train."""
         made = self.encoders(cell.task) if self.study.data else None
         return Run(
-            task=self.task(cell.task),
+            task=self.study.task(cell.task),
             learner=cell.learner,
             encoder=cell.representation.encoder(cell.task, cell.seed, made),
             encoder_seed=cell.representation.encoder_seed(cell.seed),
@@ -295,18 +286,28 @@ class Plan:
         }
 
     @property
+    def reference(self) -> dict[str, str]:
+        """SHA-256 of the file of the policy that scores 1, by its path, if it is in a file."""
+        path = frozen_file(str(self.study.verdicts.reference))
+        return {str(path): hashlib.sha256(read_file(path)).hexdigest()} if path else {}
+
+    @property
     def policies(self) -> dict[str, str]:
-        """SHA-256 of the files of policies that acted in its data sets, by their paths there."""
+        """SHA-256 of the files of policies that acted in its data sets or score 1, by their paths.
+
+        Those of data sets are within the study's folder.
+        """
         manifests = {
             path.parent.relative_to(self.folder): read_manifest(path.parent)
             for path in sorted((self.folder / "data").rglob(MANIFEST))
         }
-        return {
+        acted = {
             f"{folder}/{part['file']}": part["sha256"]
             for folder, manifest in manifests.items()
             for part in parts_of(manifest.settings.policy)
             if part["kind"] == TRAINED
         }
+        return acted | self.reference
 
     @property
     def existing_data(self) -> dict[str, str]:
@@ -377,7 +378,7 @@ class Plan:
 
     def to_register(self, policies: dict[str, str]) -> Registration:
         """What is going to be run, as it is now, and the policies that will collect data."""
-        used = [environment_versions(self.task(name)).items() for name in self.study.tasks]
+        used = [environment_versions(self.study.task(name)).items() for name in self.study.tasks]
         return Registration(
             study=to_plain(self.study),
             encoders=self.fingerprints,

@@ -24,7 +24,7 @@ from jbrep.evaluation.evaluation import EVALUATION, Evaluation
 from jbrep.machine import cores
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method
-from jbrep.play.sources import find_good_policy, find_policy
+from jbrep.play.sources import find_good_policy, find_player, find_policy
 from jbrep.pool import ATTEMPTS, side_by_side
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
@@ -42,12 +42,12 @@ def check(plan: Plan) -> None:
     for each in every_made(plan):
         if each.data.folder:
             given = Dataset(each.folder).task
-            check_same(plan.task(each.task), given, f"the data set {each.folder}")
+            check_same(plan.study.task(each.task), given, f"the data set {each.folder}")
             each.fitter()
         else:
             each.to_collect()
     for name in plan.study.tasks:
-        task = plan.task(name)
+        task = plan.study.task(name)
         if task.id.startswith(INSTANCE):
             raise InputError(
                 f"{task.id} exists in this process alone, not in those of runs: give its class"
@@ -55,6 +55,7 @@ def check(plan: Plan) -> None:
         for representation in by_name(plan):
             _check_by_name(plan, representation, task)
     _check_own(plan)
+    _check_reference(plan)
     of_each = {(cell.task, repr(cell.learner)): cell for cell in plan.cells}
     for cell in of_each.values():  # the representation decides no setting of a learner
         run = plan.run(cell).replace(encoder=FULL)
@@ -97,6 +98,19 @@ def _check_own(plan: Plan) -> None:
                 _check_encoder(run)
         except InputError as error:
             raise InputError(f"run {cell.name} can't start: {error}") from None
+
+
+def _check_reference(plan: Plan) -> None:
+    """Check that the policy that scores 1 can play one of the tasks; others have no score then."""
+    problem, named = None, plan.study.verdicts.reference
+    for task in map(plan.study.task, plan.study.tasks if isinstance(named, str) and named else ()):
+        try:
+            find_player(named, task).begin(task, [0])
+            return
+        except InputError as error:
+            problem = problem or InputError(f"verdicts.reference can't play {task.name}: {error}")
+    if problem:
+        raise problem
 
 
 def _check_encoder(run: Run) -> None:
@@ -183,7 +197,7 @@ class NeededData:
 
     def policy(self) -> Policy:
         """The policy that collects it; that of a run stays as the data set has it."""
-        task = self.plan.task(self.task).undisturbed
+        task = self.plan.study.task(self.task).undisturbed
         try:
             policy = find_policy(self.data.policy, self.folder, task)
             policy.begin(task, [0])  # may refuse the task
@@ -193,7 +207,7 @@ class NeededData:
 
     def to_collect(self) -> tuple[DataSettings, Policy]:
         """Its settings, with states where the task has them, and its policy."""
-        task, policy = self.plan.task(self.task).undisturbed, self.policy()
+        task, policy = self.plan.study.task(self.task).undisturbed, self.policy()
         settings = DataSettings(
             task=task,
             policy=policy.settings(),
@@ -242,8 +256,8 @@ def every_made(plan: Plan) -> list[NeededData]:
 
 
 def policies(plan: Plan) -> dict[str, str]:
-    """SHA-256 of the files of policies that are going to collect data, as `Plan.policies`."""
-    return {
+    """SHA-256 of the files of policies that will collect data or score 1, as `Plan.policies`."""
+    return plan.reference | {
         f"{each.folder.relative_to(plan.folder)}/{part['file']}": part["sha256"]
         for each in every_made(plan)
         if not each.data.folder

@@ -11,7 +11,7 @@ from msgspec import Meta
 from jbrep.encoders import FULL, load
 from jbrep.encoders.base import OWN
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError
 from jbrep.records.document import Document
 from jbrep.records.record import MOST_WHOLE, Record, Sha256, Version, from_plain, pattern, to_plain
 from jbrep.records.storage import exists
@@ -20,7 +20,7 @@ from jbrep.rl.run_settings import RunSettings, SharedSettings
 from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.runs import in_order
 from jbrep.studies.config import Study
-from jbrep.studies.plan import Plan, read_plan
+from jbrep.studies.plan import REGISTRATION, Plan, read_plan
 
 RECORD = "runs.json"
 EACH_ITS_OWN = "runs have different encoders"
@@ -235,6 +235,11 @@ class RunsRecord(Document, frozen=True, kw_only=True):
 def _registered(plan: Plan, runs: Collection[RunRecord]) -> RegistrationFacts | None:
     """When a study was registered, and how what ran differs from that; None if it wasn't."""
     if (found := plan.registration) is None:
+        if any(run.settings.registration for run in runs):
+            raise DamageError(
+                f"{plan.folder / REGISTRATION} is missing, and runs were made under it: copy the "
+                "registration beside the study's file there"
+            )
         return None
     return RegistrationFacts(
         sha256=found.sha256,

@@ -30,7 +30,7 @@ from jbrep.studies.plan import (
     registration_in,
 )
 from jbrep.studies.prepare import EVALUATIONS, check, policies, prepare, say
-from jbrep.studies.tables import REFERENCE_RETURNS, play_references, write_tables
+from jbrep.studies.tables import REFERENCE_RETURNS, play_references, write_tables, writing
 
 ERROR = "error.txt"  # the traceback of a run that crashed
 CRASHED = "crashed"
@@ -174,7 +174,7 @@ def run_study(plan: Plan, backend: Backend = on_this_machine, workers: int | Non
         plan.begin()
         if registered:
             plan.register(registered)
-        elif plan.study.has_claims and not plan.has_begun:
+        elif plan.study.verdicts.claims and not plan.has_begun:
             plan.register(plan.to_register(policies(plan)))
         prepare(plan, workers)
         for cell in plan.cells:  # so that any mistake shows before the first run
@@ -188,7 +188,8 @@ def run_study(plan: Plan, backend: Backend = on_this_machine, workers: int | Non
                     say(f"{number}/{len(plan.cells)} {each.name} {each.status}: {each.message}")
                     crashed += each.status == CRASHED
         if runs_below(plan.folder):
-            write_tables(plan.folder)
+            with writing(plan.folder):
+                write_tables(plan.folder)
             play_references(plan.folder)
     return crashed
 

@@ -7,6 +7,7 @@ import hashlib
 import json
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from jbrep.errors import DamageError, InputError, Notice
 from jbrep.play.references import play, policies_of
 from jbrep.records.document import read_document
 from jbrep.records.record import to_plain
-from jbrep.records.storage import exists
+from jbrep.records.storage import exclusive, exists
 from jbrep.records.tables import read_rows, write_csv, write_rows
 from jbrep.rl import files
 from jbrep.stats import RunCurve
@@ -28,6 +29,7 @@ from jbrep.text import counted
 
 RETURNS = "returns.csv"
 REFERENCE_RETURNS = "references.csv"
+_MOST_SECONDS = 600.0
 RUN_INFOS = "run-infos.csv"  # a run may be in the same folder: its own table is infos.csv
 
 References = dict[str, dict[str, list[float]]]  # returns by task and policy
@@ -145,8 +147,16 @@ def _references(folder: Path, known: Mapping[str, str]) -> References:
     return found
 
 
+def writing(folder: Path) -> AbstractContextManager[None]:
+    """Be the only writer of the tables in a folder; another process is waited for."""
+    return exclusive(folder / RECORD, beside=True, wait=_MOST_SECONDS)
+
+
 def write_tables(folder: Path) -> None:
-    """Write the tables of the runs below a folder, of a study or not, as far as they have ended."""
+    """Write the tables of the runs below a folder, of a study or not, as far as they have ended.
+
+    Within `writing`.
+    """
     ended = _ended(folder)
     returns, infos = _of_runs(ended, files.read_evaluations), [*_of_runs(ended, files.read_infos)]
     record = RunsRecord.of(folder, ended)
@@ -233,10 +243,12 @@ def play_references(folder: Path) -> None:
             if damage and not played:
                 raise damage
             rows += (_Reference(name, policy, i, each) for i, each in enumerate(played))
-    if rows:
-        sha256 = write_csv(
-            folder / REFERENCE_RETURNS, ("task", "policy", "episode", "return"), rows
-        )
+    if not rows:
+        return
+    with writing(folder):
+        path = folder / REFERENCE_RETURNS
+        sha256 = write_csv(path, ("task", "policy", "episode", "return"), rows)
+        record = read_document(folder / RECORD, RunsRecord)  # a report may have written meanwhile
         record.with_table(REFERENCE_RETURNS, sha256).write(folder / RECORD)
 
 

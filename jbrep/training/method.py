@@ -11,22 +11,9 @@ from jbrep.dataset import ScaledDataset
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.records.record import Record, bare, default_of, from_text, to_plain, type_of
+from jbrep.training import settings
 from jbrep.training.network import get_architecture
 from jbrep.training.objective import Layers, Objective
-from jbrep.training.settings import (
-    BatchSize,
-    Clip,
-    Codes,
-    Epochs,
-    FeatureWeights,
-    Keep,
-    Latent,
-    LearningRate,
-    LeaveOut,
-    On,
-    Scaling,
-    Seed,
-)
 
 
 class Made(NamedTuple):
@@ -50,10 +37,10 @@ class Method(Record, frozen=True, kw_only=True):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # named sets of settings
     min_reduction: ClassVar[int | None] = None  # of features to numbers; None: any size will do
 
-    scaling: Scaling = "extrema"
-    on: On = "observation"
-    leave_out: LeaveOut = ()
-    clip: Clip = None
+    scaling: settings.Scaling = "extrema"
+    on: settings.On = "observation"
+    leave_out: settings.LeaveOut = ()
+    clip: settings.Clip = None
 
     @property
     def keep(self) -> tuple[str, ...]:
@@ -80,10 +67,10 @@ class Method(Record, frozen=True, kw_only=True):
         if unknown := [name for name in given if name not in kinds]:
             raise InputError(f"{cls.name} takes no {unknown[0]}: leave it out")
         read = {n: _read(v, kinds[n], n) for n, v in given.items() if v is not None}
-        settings = {**cls.defaults(read), **read}
-        if missing := [name for name in kinds if name not in settings]:
+        values = {**cls.defaults(read), **read}
+        if missing := [name for name in kinds if name not in values]:
             raise InputError(f"{cls.name} needs {missing[0]}: there is no default")
-        return cls(**settings)
+        return cls(**values)
 
     @classmethod
     def words(cls) -> str:
@@ -126,9 +113,9 @@ class Coded(Method, frozen=True, kw_only=True):
 
     min_reduction: ClassVar[int | None] = 1
 
-    latent: Latent
-    keep: Keep = ()
-    codes: Codes = "raw"
+    latent: settings.Latent
+    keep: settings.Keep = ()
+    codes: settings.Codes = "raw"
 
     def check_data(self, data: ScaledDataset) -> None:
         largest = self.largest(data.size)
@@ -170,10 +157,10 @@ class ClosedForm(Method, frozen=True, kw_only=True):
 class Learned(Coded, frozen=True, kw_only=True):
     """A method that trains a network by gradients."""
 
-    epochs: Epochs = 12
-    batch_size: BatchSize = None
-    learning_rate: LearningRate = 2e-3
-    seed: Seed = 0
+    epochs: settings.Epochs = 12
+    batch_size: settings.BatchSize = None
+    learning_rate: settings.LearningRate = 2e-3
+    seed: settings.Seed = 0
 
     def objective(self, data: ScaledDataset) -> Objective:
         """What it trains, on scaled data."""
@@ -183,7 +170,7 @@ class Learned(Coded, frozen=True, kw_only=True):
 class Reconstructing(Learned, frozen=True, kw_only=True):
     """A method that learns to reconstruct rows, with weights of their features."""
 
-    weights: FeatureWeights = field(default_factory=dict)
+    weights: settings.FeatureWeights = field(default_factory=dict)
 
 
 def _read(value: Any, kind: Any, name: str) -> Any:

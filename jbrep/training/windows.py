@@ -51,11 +51,6 @@ class Windows:
         return self._count
 
     @property
-    def size(self) -> int:
-        """Length of a scaled row."""
-        return self._data.size
-
-    @property
     def numbers(self) -> Tensor:
         """The numbers of all windows, (n,)."""
         return torch.arange(len(self), device=self.device)

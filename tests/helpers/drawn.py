@@ -10,10 +10,7 @@ import pandas
 import polars
 import pyarrow as pa
 import pyarrow.parquet as pq
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from foreign import open_bag, write_lerobot
 
 START = datetime(2026, 3, 14, 11, 59, 58, tzinfo=UTC)
 SEPARATORS = (",", ";", "\t", "|")
@@ -226,43 +223,28 @@ def lerobot(truth, random, path):
     columns = truth.columns()
     state = np.stack([columns[name] for name in truth.features], axis=1)
     action = np.stack([columns[name] for name in truth.commands], axis=1)
-    table = pa.table(
-        {
-            "observation.state": pa.array(state.tolist(), pa.list_(pa.float32(), state.shape[1])),
-            "action": pa.array(action.tolist(), pa.list_(pa.float32())),
-            "next.reward": pa.array(columns["gain"].astype(np.float32)),
-            "timestamp": pa.array((step * truth.timestep).astype(np.float32)),
-            "frame_index": step,
-            "episode_index": columns["trial"],
-        }
-    )
-    (path / "data/chunk-000").mkdir(parents=True)
-    (path / "meta").mkdir()
-    cut = int(random.integers(0, len(table) + 1))
-    for file, (begin, rows) in enumerate([(0, cut), (cut, len(table) - cut)]):
-        if rows:
-            pq.write_table(
-                table.slice(begin, rows), path / f"data/chunk-000/file-{file:03d}.parquet"
-            )
+    rows = {
+        "observation.state": pa.array(state.tolist(), pa.list_(pa.float32(), state.shape[1])),
+        "action": pa.array(action.tolist(), pa.list_(pa.float32())),
+        "next.reward": pa.array(columns["gain"].astype(np.float32)),
+        "timestamp": pa.array((step * truth.timestep).astype(np.float32)),
+        "frame_index": step,
+        "episode_index": columns["trial"],
+    }
+    cut = int(random.integers(0, len(step) + 1))
     known = {
         "observation.state": {"dtype": "float32", "shape": [state.shape[1]], "names": None},
         "action": {"dtype": "float32", "shape": [action.shape[1]], "names": None},
     }
     info = {"codebase_version": "v3.0", "fps": round(1 / truth.timestep), "features": known}
-    (path / "meta/info.json").write_text(json.dumps(info))
-    return path, [], {}
+    return write_lerobot(path, rows, cut, info), [], {}
 
 
 def bag(truth, random, path):
     """A bag whose topics have a message at each step, the action's as long after as drawn."""
     kind = str(random.choice(["bag", "mcap", "db3"]))
-    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
-    if kind == "bag":
-        path = path.with_suffix(".bag")
-        writer, pack = Writer1(path), store.serialize_ros1
-    else:
-        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-        writer, pack = Writer2(path, version=9, storage_plugin=plugin), store.serialize_cdr
+    path = path.with_suffix(".bag") if kind == "bag" else path
+    store, writer, pack = open_bag(path, kind)
     number = store.types["std_msgs/msg/Float64"]
     topics = [*truth.features, *truth.commands, "gain"]
     columns = truth.columns()

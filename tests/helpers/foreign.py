@@ -89,15 +89,32 @@ def lerobot_folder(folder, version="v3.0", **features):
         "index": pa.array(np.arange(33)),
         "task_index": pa.array(np.zeros(33, int)),
     }
+    info = {"codebase_version": version, "fps": 30, "features": known}
+    return write_lerobot(folder, columns, 21, info)
+
+
+def write_lerobot(folder, columns, cut, info):
+    """A folder of LeRobot whose rows are in two files, or in one."""
     table = pa.table(columns)
     (folder / "data/chunk-000").mkdir(parents=True)
     (folder / "meta").mkdir()
-    for file, (begin, end) in enumerate([(0, 21), (21, 33)]):
+    for file, (begin, rows) in enumerate([(0, cut), (cut, len(table) - cut)]):
         path = folder / f"data/chunk-000/file-{file:03d}.parquet"
-        pq.write_table(table.slice(begin, end - begin), path)
-    info = {"codebase_version": version, "fps": 30, "features": known}
+        if rows:
+            pq.write_table(table.slice(begin, rows), path)
     (folder / "meta/info.json").write_text(json.dumps(info))
     return folder
+
+
+def open_bag(path, kind):
+    """A bag's types, its writer, and what packs a message."""
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
+    if kind == "bag":
+        writer, pack = Writer1(path), store.serialize_ros1
+    else:
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer, pack = Writer2(path, version=9, storage_plugin=plugin), store.serialize_cdr
+    return store, writer, pack
 
 
 def write_bag(path, kind, silent=(), joints=("hip", "knee"), count=0, compressed=()):
@@ -105,12 +122,7 @@ def write_bag(path, kind, silent=(), joints=("hip", "knee"), count=0, compressed
 
     Messages of silent joints, by their numbers, have none.
     """
-    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
-    if kind == "bag":
-        writer, pack = Writer1(path), store.serialize_ros1
-    else:
-        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-        writer, pack = Writer2(path, version=9, storage_plugin=plugin), store.serialize_cdr
+    store, writer, pack = open_bag(path, kind)
     if compressed:
         writer.set_compression(*compressed)
     types = store.types

@@ -26,10 +26,6 @@ class _NoTextError(Exception):
         raise ValueError("no text")
 
 
-class _Base(BaseException):
-    """No Exception."""
-
-
 def _raise(error):
     raise error
 
@@ -97,7 +93,7 @@ FAILS = {  # it is a failure like any other
     "exit": lambda: sys.exit(),
     "exit 0": lambda: sys.exit(0),
     "exit with words": lambda: sys.exit("goodbye\nand thanks"),
-    "BaseException": lambda: _raise(_Base("odd")),
+    "BaseException": lambda: _raise(BaseException("odd")),
     "GeneratorExit": lambda: _raise(GeneratorExit),
     "StopIteration": lambda: _raise(StopIteration),
     "error without text": lambda: _raise(_NoTextError),
