@@ -100,9 +100,9 @@ def test_failing_never_pays(runs):
         assert others == [("undecided", "not tested: 'not worse' is contradicted")] * 2
 
 
-def test_a_floor_that_is_known_is_what_failed_runs_count_as(runs):
-    floor = [RunCurve(**{**vars(run), "return_floor": -3254.0}) for run in runs]
-    group = analyse(floor).groups[0]
+@pytest.mark.parametrize("known", ["return_floor", "reference"])
+def test_a_failed_run_counts_as_the_floor_or_at_most_as_a_blind_policy(runs, known):
+    group = analyse([RunCurve(**{**vars(run), known: -3254.0}) for run in runs]).groups[0]
     assert group.failure_return == group.ends.blind == -3254
     assert result(group, "dae-1").by_run["final_return"][5] == -3254
 
