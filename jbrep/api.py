@@ -219,10 +219,12 @@ def collect(
     settings = settings.replace(
         shard_episodes=shard_episodes or usual_shard_episodes(settings, folder, actor, retries)
     )
+    files = actor.files()
     for part in parts_of(settings.policy):
-        if part["kind"] == TRAINED and exists(folder / part["file"]):
+        kept = folder / part.get("file", "")
+        if part["kind"] == TRAINED and exists(kept) and kept.read_bytes() == files[kept.name]:
             acts = f"{part['run']} acts as it did at step {part['step']:,}"
-            _note(f"{acts}, which {folder / part['file']} keeps")
+            _note(f"{acts}, which {kept} keeps")
     run(settings, folder, num_envs, threads, actor, retries)
     return Dataset(folder)
 
@@ -276,7 +278,7 @@ def train_encoders(
     """
     from jbrep.methods.registry import named_settings, with_preset
 
-    sizes = [latent] if isinstance(latent, int) else latent
+    sizes = [latent] if isinstance(latent, str) or not hasattr(latent, "__len__") else latent
     named = named_settings(kind, sizes, seeds, name, with_preset(kind, preset, settings))
     fitter = _fitter(data, out, device)
     for called, each in named:  # every mistake is reported before the first training
@@ -400,6 +402,7 @@ def train(
             f"train has no {unknown[0]!r}: give a setting of {algorithm} as "
             f"overrides={{{unknown[0]!r}: ...}}"
         )
+    preset, begin_from = str(preset), str(begin_from)  # paths are taken, too
     known = check_learner(task, algorithm, preset, encoder, begin_from)
     from jbrep.machine import cores
     from jbrep.rl.history import Bar
@@ -545,6 +548,7 @@ def report(
     """
     from jbrep.records.storage import exists, make_folder
 
+    evaluation = [evaluation] if isinstance(evaluation, str | Path) else evaluation
     if not exists(folder):
         raise InputError(f"{folder} is not the folder of a study: there is no such folder")
     if out:

@@ -1,6 +1,7 @@
 """Progress of long work: a bar on a terminal, a line now and then in a log."""
 
 import sys
+from contextlib import suppress
 from typing import Any, TextIO
 
 from tqdm import tqdm
@@ -46,8 +47,10 @@ class _Log:
         self._stream = stream
 
     def write(self, text: str) -> None:
-        if line := text.strip():
-            self._stream.write(f"{line}\n")
+        with suppress(OSError):  # whoever read it may have gone
+            if line := text.strip():
+                self._stream.write(f"{line}\n")
 
     def flush(self) -> None:
-        self._stream.flush()
+        with suppress(OSError):
+            self._stream.flush()

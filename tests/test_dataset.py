@@ -17,14 +17,7 @@ from jbrep.collecting.derive import derive
 from jbrep.collecting.replay import replay_problems
 from jbrep.dataset import Dataset, manifest
 from jbrep.dataset.columns import Column
-from jbrep.dataset.manifest import (
-    MANIFEST,
-    commit,
-    find_problems,
-    open_shard,
-    read_manifest,
-    write_manifest,
-)
+from jbrep.dataset.manifest import MANIFEST, commit, find_problems, open_shard, read_manifest
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 
@@ -173,7 +166,7 @@ def test_a_data_set_as_json(dataset):
 
 def test_an_unfinished_data_set_is_called_so(collected, tmp_path):
     whole = manifest.read_manifest(collected)
-    manifest.write_manifest(tmp_path, whole.replace(shards=()))
+    whole.replace(shards=()).write(tmp_path / MANIFEST)
     empty = Dataset(tmp_path)
     assert len(empty) == len(empty["observation"][:]) == 0
     assert "that were asked for" in empty.card()
@@ -252,11 +245,11 @@ def test_what_can_t_be_derived(collected, copied, tmp_path):
         derive(collected, copied, HIDDEN)
     manifest = read_manifest(copied)
     older = {**manifest.versions, "mujoco": "3.16.9"}
-    write_manifest(copied, manifest.replace(versions=older))
+    manifest.replace(versions=older).write(copied / MANIFEST)
     with pytest.raises(InputError, match="a derived data set needs the same"):
         derive(copied, tmp_path / "x", HIDDEN)
     (copied / "shard-00004.h5").unlink()
-    write_manifest(copied, manifest.replace(shards=manifest.shards[:4]))
+    manifest.replace(shards=manifest.shards[:4]).write(copied / MANIFEST)
     with pytest.raises(InputError, match="is unfinished"):
         derive(copied, tmp_path / "x", HIDDEN)
     assert not (tmp_path / "x").exists()
@@ -322,7 +315,7 @@ def test_what_can_t_be_extended_is_left_as_it_is(short, tmp_path):
         collect(two_by_two(400, seed=4), folder)
     manifest = read_manifest(folder)
     changed = manifest.replace(versions={**manifest.versions, "mujoco": "3.0"})
-    write_manifest(folder, changed)
+    changed.write(folder / MANIFEST)
     with pytest.raises(InputError, match=r"mujoco 3\.0"):
         collect(two_by_two(400), folder)
     assert read_manifest(folder) == changed

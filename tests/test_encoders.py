@@ -269,18 +269,16 @@ def test_the_linear_decoder_is_the_best(data, rows, made):
     np.testing.assert_allclose(run(decoder, code), wide @ best, atol=1e-4)
 
 
-def test_a_unit_that_says_nothing_can_be_scaled_but_not_whitened(data, rows, made):
+@pytest.mark.parametrize("codes", ["standard", "white"])
+def test_a_unit_that_says_nothing_stays_so(data, rows, codes):
     weight = np.random.default_rng(0).normal(size=(3, data.size))
     weight[1] = 0
     dead = Made((dense(weight, np.ones(3)),))
-    encoder, decoder, _ = complete(dead, data, "standard")
+    encoder, decoder, _ = complete(dead, data, codes)
     code = run(encoder, rows)
     np.testing.assert_allclose(code[:, 1], 0, atol=1e-6)
     np.testing.assert_allclose(code.std(axis=0)[[0, 2]], 1 / 3, rtol=1e-3)
     assert np.isfinite(run(decoder, code)).all()
-    with pytest.raises(InputError, match="the covariance of the code is singular") as refused:
-        complete(dead, data, "white")
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(

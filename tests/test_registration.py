@@ -14,7 +14,7 @@ from test_study import TINY
 
 from jbrep.collecting import collect
 from jbrep.dataset import Dataset
-from jbrep.dataset.manifest import read_manifest, write_manifest
+from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.encoders import find, load, save
 from jbrep.envs import describe
 from jbrep.errors import DamageError, InputError
@@ -336,7 +336,7 @@ def test_a_manifest_says_the_commit_of_its_start_and_resumes_at_another(collecte
     assert read_manifest(collected).commits == dict(of_git.commits())
     folder = tmp_path / "data"
     manifest = write_again(collected, folder).replace(commits={"jbrep": HEAD})
-    write_manifest(folder, manifest.replace(shards=manifest.shards[:4]))
+    manifest.replace(shards=manifest.shards[:4]).write(folder / MANIFEST)
     collect(settings(), folder)
     assert read_manifest(folder) == manifest
     assert Dataset(folder).fingerprint == Dataset(collected).fingerprint

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -14,24 +15,33 @@ from command import jbrep, mistake, refused
 from gymnasium.spaces import Box
 from small import brief as settings
 from small import write_again
+from stable_baselines3 import A2C
 
-from jbrep import api
-from jbrep.collecting.policies import Heuristic
+from jbrep import JitterbugVecEnv, api
+from jbrep.collecting import collect
+from jbrep.collecting.backends import _can_be_sent
+from jbrep.collecting.policies import Heuristic, UserPolicy
+from jbrep.coordinates import make_coordinates
 from jbrep.dataset import DamageError, Dataset, Layout, ScaledDataset, from_file, from_table
 from jbrep.dataset.manifest import find_problems, open_shard
-from jbrep.encoders import Encoder, find
-from jbrep.envs import describe
+from jbrep.encoders import Encoder, find, save
+from jbrep.envs import Feature, Task, describe
 from jbrep.envs.autoreset import AutoresetEnvironments
 from jbrep.envs.description import with_features
-from jbrep.envs.environments import Environments
+from jbrep.envs.environments import Environments, Retries
 from jbrep.errors import STEP_TIMEOUT, InputError, Notice
 from jbrep.evaluation.diagnosis import seen
+from jbrep.evaluation.evaluation import Score, measured
 from jbrep.inspection.scene import as_qpos
+from jbrep.methods.fit import Fitter
 from jbrep.play.references import policies_of
+from jbrep.progress import _Log
 from jbrep.records.record import from_plain
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.overrides import overridden
+from jbrep.stats.intervals import Bounds, surely_above
 from jbrep.studies.config import Study, as_study
+from jbrep.training.objective import feature_weights
 
 STUDY = {"tasks": ["Pendulum-v1"], "algorithms": ["sac"], "representations": ["full"], "seeds": [0]}
 OPTIONS = ("--task", "Pendulum-v1", "--episode-steps", 20)
@@ -337,3 +347,166 @@ def test_a_class_of_a_script_has_the_same_digest_in_each_process():
     script = "class A: pass\nfrom jbrep.envs.names import digest_of\nprint(digest_of(A))"
     runs = [subprocess.run([sys.executable, "-c", script], capture_output=True) for _ in "ab"]
     assert runs[0].stdout == runs[1].stdout != b""
+
+
+class Rail(gymnasium.Env):
+    """A cart on a rail; `how` it differs from a plain one."""
+
+    observation_space, action_space = Box(-9, 9, (2,)), Box(-1, 1, (1,))
+    breaks = False  # in the first step of an episode that begins on the right
+
+    def __init__(self, how="", scale=1.0):
+        self.how, self.scale, self.steps = how, scale, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if self.how == "global":
+            np.random.seed(seed)  # noqa: NPY002
+        self.state, self.steps = self.np_random.uniform(-1, 1, 2).astype(np.float32), 0
+        return self.state.copy(), {}
+
+    def step(self, action):
+        self.steps += 1
+        if self.breaks and self.steps == 1 and self.state[0] > 0:
+            raise OSError("unplugged")
+        noise = np.random.randn() if self.how == "global" else 0  # noqa: NPY002
+        self.state = np.clip(self.state + 0.1 * (action[0] + noise), -9, 9, dtype=np.float32)
+        return self.state.copy(), self.scale * float(self.state[0]), False, False, {}
+
+
+gymnasium.register("Regressions/Rail-v0", Rail, max_episode_steps=4, reward_threshold=9)
+
+
+def test_an_instance_is_one_robot_and_local_classes_are_several():
+    one = describe(Rail(), episode_steps=4)
+    alone = api.evaluate_policy("still", task=one, episodes=3, threads=1)
+    assert [*api.evaluate_policy("still", task=one, episodes=3)] == [*alone]
+    with Environments(one, 1), pytest.raises(InputError, match="exists once"):
+        Environments(one, 1)
+
+    def robot(scale):
+        class Local(Rail):
+            def __init__(self):
+                super().__init__(scale=scale)
+
+        return Local
+
+    few, many = (describe(robot(scale), episode_steps=4) for scale in (1.0, 100.0))
+    returns = [np.sum(api.evaluate_policy("still", task=each, episodes=2)) for each in (few, many)]
+    assert returns[1] == pytest.approx(100 * returns[0])
+
+
+def test_what_gymnasium_made_keeps_its_time_limit_and_a_threshold_is_of_its_own():
+    task = describe(gymnasium.make("Regressions/Rail-v0", max_episode_steps=3))
+    assert (task.max_episode_steps, task.solved_return) == (3, None)
+    assert describe("Regressions/Rail-v0").solved_return == 9
+
+
+def test_who_shares_a_generator_with_others_is_not_reproducible():
+    made = {how: describe("Regressions/Rail-v0", env={"how": how}) for how in ("", "global")}
+    assert [each.reproducible for each in made.values()] == [True, False]
+
+
+@pytest.mark.parametrize(
+    "odd", [{"env": {"how": b"x"}}, {"action_bounds": ((-1, 1), (3,))}, {"hide": "none"}]
+)
+def test_odd_descriptions_are_refused(odd):
+    with pytest.raises(InputError, match=r"env|action_bounds|'none'"):
+        describe("Regressions/Rail-v0", **odd)
+
+
+def test_a_first_step_that_fails_has_no_reward_of_the_episode_before(monkeypatch):
+    envs = AutoresetEnvironments(describe("Regressions/Rail-v0"), 4, retries=99)
+    monkeypatch.setattr(Rail, "breaks", True)
+    envs.reset([0, 1, 2, 3])
+    with pytest.warns(Notice, match="unplugged"):
+        steps = [envs.step(np.ones((4, 1))) for _ in range(20)]
+    lost = [step.reward[i] for step in steps for i in range(4) if not step.length[i]]
+    assert lost
+    assert not np.any(lost)
+
+
+def test_a_heading_comes_back_whatever_the_order_of_features():
+    kinds = {"v_x": "vector", "v_y": "vector", "goal_x": "offset", "goal_y": "offset"}
+    told = [Feature(n, kind=k, frame="world", group=k) for n, k in kinds.items()]
+    told.append(Feature("heading", "rad", kind="angle", frame="world"))
+    rows = np.array([[0.3, 0.4, 1.0, 2.0, 0.0]])
+    for order in (range(5), (4, 0, 1, 2, 3)):
+        features = tuple(told[i] for i in order)
+        ends = {"action_low": (-1,), "action_high": (1,), "max_episode_steps": 9}
+        task = Task(id="Planar-v0", name="Planar-v0", features=features, **ends)
+        made = make_coordinates(task, "symmetry")
+        back = made.inverse(made.forward(rows[:, order]))
+        np.testing.assert_allclose(back, rows[:, order], atol=1e-5)
+
+
+def test_one_lucky_run_is_not_above_the_least_return():
+    assert not surely_above(np.array([*[0.0] * 7, 1.0]), 0.0, Bounds(0.0))
+    assert surely_above(np.array([*[1.0] * 7, 2.0]), 0.0, Bounds(0.0))
+
+
+def test_encoders_of_other_features_or_weights_are_others(tmp_path):
+    table = dict(zip("xyu", np.random.default_rng(0).normal(size=(3, 60)), strict=True))
+    layout = {"observations": ("x", "y"), "actions": ("u",), "length": 20}
+    plain, angle = (
+        ScaledDataset(from_table(tmp_path / name, table, Layout(**layout, angles=angles)))
+        for name, angles in (("plain", ()), ("angle", ("x",)))
+    )
+    encoder = Fitter(plain, tmp_path / "out").fit("pca", latent=1).encoder
+    assert "features" in refused(Fitter(angle, tmp_path / "out").fit, "pca", latent=1)
+    assert "4,096" in refused(Fitter(plain, tmp_path).plan, "ofe", latent=2500)
+    for weights in ({"x": 5, "*": 1}, {"*": 1, "x": 5}):
+        assert feature_weights(plain, weights).tolist() == [5, 1]
+    out = tmp_path / "text"
+    assert "is 12:" in refused(api.train_encoders, tmp_path / "plain", out, "pca", latent="12")
+    encoder = encoder.with_header(
+        training={"epochs": 9}, metrics={"epochs": 2, "held_out_mse": 0.1}
+    )
+    save(encoder, tmp_path / "stopped.safetensors")
+    with pytest.warns(Notice, match="2 epochs of 9"):
+        find(tmp_path / "stopped.safetensors", plain.task)
+
+
+def test_a_score_that_is_not_finite_is_not_known(monkeypatch):
+    odd = [(lambda judged: Score(np.nan, 0.0, np.inf), ("odd",))]
+    monkeypatch.setattr("jbrep.evaluation.evaluation._REGISTERED", odd)
+    assert measured(None) == {"odd": Score(None, 0.0, None)}
+
+
+def test_rows_count_until_more_of_their_shard_are_written(tmp_path, monkeypatch):
+    collect(settings(steps=150, shard_episodes=3), tmp_path)
+    data = Dataset(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr("jbrep.dataset.manifest.write_whole", lambda *_: refuse())
+        assert "2 episodes of 200 rows are kept" in refused(
+            collect, settings(steps=300, shard_episodes=3), tmp_path
+        )
+    assert len(Dataset(tmp_path)) == 200
+    collect(settings(steps=300, shard_episodes=3), tmp_path)
+    assert "open it again" in refused(lambda: data["reward"][:])
+
+
+def refuse(*given):
+    raise InputError("no space")
+
+
+def test_a_model_that_saw_scaled_states_is_refused_and_odd_policies_stay_here():
+    model = A2C("MlpPolicy", JitterbugVecEnv("face_direction", 1))
+    assert "scaled" in refused(UserPolicy.of, model)
+    odd = type("Odd", (), {"__reduce__": lambda self: 1 / 0})
+    assert not _can_be_sent(odd())
+    assert "retries" in refused(Retries, -1)
+
+
+def gone(*_):
+    raise BrokenPipeError
+
+
+def test_nobody_who_reads_and_no_working_folder(tmp_path, monkeypatch, brief):
+    stream = SimpleNamespace(write=gone, flush=gone)
+    _Log(stream).write("a line")
+    _Log(stream).flush()
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert jbrep("data", "info", brief).exit_code == 0

@@ -113,7 +113,7 @@ def test_the_motion_is_what_was_observed(task, joints):
     assert 10 < len(rollout) <= 30
     assert rollout.terminated != rollout.truncated
     assert rollout.motion.qpos.shape == (len(rollout) + 1, joints)
-    seen = np.concatenate((rollout.motion.qpos[:, 1:], rollout.motion.qvel), axis=1)
+    seen = np.concatenate((rollout.motion.qpos[:, 1:], rollout.motion.arrays["qvel"]), axis=1)
     np.testing.assert_allclose(seen.clip(-10, 10), rollout.observation, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(rollout.motion.arrays["ctrl"][1:], rollout.action, rtol=1e-6)
     assert find_player("uniform", short(task)).returns(2)[1] == pytest.approx(

@@ -347,8 +347,6 @@ def test_an_analysis_is_judged_against_the_baseline(analysis):
     assert worse.numbers["reached_90_percent"].value == 0
     against = group.comparisons[1]
     assert against.numbers["probability_of_improvement"].value == 0
-    assert against.numbers["steps_to_50_percent_ratio"].low > 1
-    assert against.numbers["steps_to_90_percent_ratio"].tolist() == [None] * 3
     assert group.verdicts == ()
     expected = stats.levene(*(label.by_run["final_return"] for label in (full, group.labels[1])))
     assert group.comparisons[0].brown_forsythe_p == pytest.approx(expected.pvalue)

@@ -83,7 +83,7 @@ def turn_targets(envs: Environments, yaw: float) -> None:
     turned = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
     targets = {"target_quaternion": np.tile(turned, (envs.num_envs, 1))}
     simulation.restore(**simulation.state | targets)
-    envs.observation = envs.instances.look()
+    envs.observation = simulation.observe()
 
 
 def watch(players: Sequence[Player], episodes: int, target_yaw: float) -> Visits:
@@ -96,7 +96,7 @@ def watch(players: Sequence[Player], episodes: int, target_yaw: float) -> Visits
             some = range(first, min(first + BATCH, episodes))
             for each in player.play(some, lambda envs: turn_targets(envs, target_yaw)):
                 returns.append(each.episode_return)
-                motor.append(each.motion.qvel[:, -1].copy())  # a view would keep all
+                motor.append(each.motion.arrays["qvel"][:, -1].copy())  # a view would keep all
                 place.append(each.motion.qpos[:, :2].copy())
     return Visits(np.array(returns), np.concatenate(motor), np.concatenate(place))
 

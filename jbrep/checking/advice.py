@@ -139,7 +139,7 @@ def _found(seen: Transitions, shapes: Shapes) -> tuple[Feature, ...]:
         new = old if i < 0 else _as_seen(old, seen, shapes, i)
         group = old.group if first is None else f"attitude{first}"
         if first is not None:
-            new = new.replace(kind="quaternion", low=-1.0, high=1.0, bounded=True)
+            new = new.replace(low=-1.0, high=1.0, bounded=True)
         parts[group] = parts.get(group, 0) + (group != before)
         before = group
         # what a quaternion parts is two groups
@@ -171,7 +171,9 @@ def features_toml(task: Task, features: Sequence[Feature], findings: Sequence[Fi
     lines.append(toml_text({k: v for k, v in known.items() if v is not None}).rstrip())
     for old, new in zip(task.whole.features, features, strict=True):
         comments = [
-            f"# {each.kind}: {each.evidence}" for each in findings if old.name in each.features
+            f"# {each.kind}: {each.evidence}; {each.fix}"
+            for each in findings
+            if old.name in each.features
         ]
         every = {**asdict(new), "offset": (task.offsets or {}).get(old.name)}
         said = {k: v for k, v in every.items() if v is not None and v is not False and v != ""}

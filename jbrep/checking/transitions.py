@@ -55,7 +55,7 @@ class PlayStats(NamedTuple):
 def play(task: Task, steps: int, seed: int) -> tuple[Transitions, PlayStats]:
     """Play each policy for about its share of the steps, at least four episodes, perhaps cut."""
     share = steps // len(POLICIES)
-    limit = min(task.max_episode_steps, max(_SHORTEST, share // _FEWEST))
+    limit = min(task.max_episode_steps, max(_SHORTEST, -(-share // _FEWEST)))
     cut = task.replace(max_episode_steps=limit)
     at_once = min(_AT_ONCE, max(_FEWEST, share // limit)) if task.reproducible else 1
     episodes, returns, seconds = list[_Columns](), dict[str, Array](), 0.0

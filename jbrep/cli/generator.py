@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
@@ -290,14 +291,16 @@ def _import_code(names: Iterable[str]) -> None:
     """Import the modules of names such as mymodule:MyEncoder."""
     if named := [name for name in names if ":" in name]:
         from jbrep.envs.names import import_code
+        from jbrep.records.storage import exists
 
         for name in named:
-            import_code(name)
+            if not exists(name):
+                import_code(name)
 
 
 def _import_option() -> click.Option:
     def load(context: click.Context, option: click.Parameter, modules: tuple[str, ...]) -> None:
-        if modules := (*_project_modules(Path.cwd()), *modules):
+        if modules := (*_project_modules(), *modules):
             from jbrep.envs.names import import_modules
 
             import_modules(modules)
@@ -314,11 +317,15 @@ def _import_option() -> click.Option:
     )
 
 
-def _project_modules(here: Path) -> list[str]:
+def _project_modules() -> list[str]:
     """What `import` in [tool.jbrep] names, in the nearest pyproject.toml that has it.
 
     It is looked for from the working folder up to the repository's, if that is in one.
     """
+    try:
+        here = Path.cwd()
+    except OSError:  # it was deleted
+        return []
     above = [here, *here.parents]
     top = next((i for i, folder in enumerate(above) if (folder / ".git").exists()), 0)
     for folder in above[: top + 1]:
@@ -351,18 +358,6 @@ def parse_pairs(given: Iterable[str], option: str = "--env") -> dict[str, Any]:
 # what a shell completes, by the names of parameters
 
 
-def _tasks(context: click.Context) -> Iterable[str]:
-    from jbrep.jitterbug.tasks import TASKS
-
-    return TASKS
-
-
-def _kinds(context: click.Context) -> Iterable[str]:
-    from jbrep.methods.kinds import KINDS
-
-    return KINDS
-
-
 def _shipped(context: click.Context) -> Iterable[str]:
     """Encoders of the task that stands before, or else of all."""
     from jbrep.encoders.shipped import names
@@ -381,7 +376,7 @@ def _completing(names: Callable[[click.Context], Iterable[str]]) -> Callable[...
 
 
 _COMPLETE = {
-    "task": _completing(_tasks),
-    "kind": _completing(_kinds),
+    "task": _completing(lambda context: import_module("jbrep.jitterbug.tasks").TASKS),
+    "kind": _completing(lambda context: import_module("jbrep.methods.kinds").KINDS),
     "encoder": _completing(_shipped),
 }

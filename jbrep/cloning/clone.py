@@ -27,17 +27,7 @@ from jbrep.records.commit import commits
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Finite, to_plain
 from jbrep.records.storage import exclusive, exists, make_folder, write_whole
-from jbrep.rl.files import (
-    CHECKPOINT,
-    ENCODER,
-    EVALUATION_SEED,
-    FINISHED,
-    OWN,
-    POLICY,
-    RUN,
-    RunRecord,
-    read_run,
-)
+from jbrep.rl import files
 from jbrep.rl.history import History
 from jbrep.rl.learner import Learner, usual_name
 from jbrep.rl.policy import Trained, build, pack_whole
@@ -163,15 +153,17 @@ class Job(NamedTuple):
         return cls(data, found, settings, cloned, given)
 
 
-def learn(job: Job, folder: Path, threads: int | None = None) -> tuple[RunRecord, CloneRecord]:
+def learn(
+    job: Job, folder: Path, threads: int | None = None
+) -> tuple[files.RunRecord, CloneRecord]:
     """Learn a policy and write its folder, unless it is complete; what was killed goes on."""
-    make_folder(folder, (*OWN, CLONE, _CHECKPOINT))
-    if exists(folder / CHECKPOINT):
+    make_folder(folder, (*files.OWN, CLONE, _CHECKPOINT))
+    if exists(folder / files.CHECKPOINT):
         raise InputError(f"{folder} has a run of jbrep rl: choose another folder")
     with exclusive(folder), single_thread():
-        if not exists(folder / RUN):
+        if not exists(folder / files.RUN):
             _learn(job, folder, threads)
-        run = read_run(folder)
+        run = files.read_run(folder)
         if differing := run.settings.differing(job.settings):
             raise InputError(f"{folder} has another run: {differing}; choose another folder")
         return run, read_document(folder / CLONE, CloneRecord)
@@ -219,12 +211,12 @@ def _learn(job: Job, folder: Path, threads: int | None) -> None:
         note=note,
     )
     if isinstance(job.encoder, Encoder):
-        save(job.encoder, folder / ENCODER)
+        save(job.encoder, folder / files.ENCODER)
     policy = pack_whole(trained)
-    write_whole(folder / POLICY, policy)
+    write_whole(folder / files.POLICY, policy)
     record.write(folder / CLONE)
-    RunRecord(
-        status=FINISHED,
+    files.RunRecord(
+        status=files.FINISHED,
         reason=None,
         settings=settings,
         latent_size=job.encoder.latent_size,
@@ -235,7 +227,7 @@ def _learn(job: Job, folder: Path, threads: int | None) -> None:
         cpu=cpu(),
         tables=write_tables(folder, history),
         policy_sha256=hashlib.sha256(policy).hexdigest(),
-    ).write(folder / RUN)  # last: it is complete where this exists
+    ).write(folder / files.RUN)  # last: it is complete where this exists
     (folder / _CHECKPOINT).unlink(missing_ok=True)
 
 
@@ -289,7 +281,7 @@ def _play(trained: Trained, settings: RunSettings, threads: int | None) -> Outco
     if not is_batched(trained.task):
         most = min(most, threads or most)
     with envs_at_once(trained.task, most, threads, 0) as envs:
-        seeds = range(EVALUATION_SEED, EVALUATION_SEED + count, envs.num_envs)
+        seeds = range(files.EVALUATION_SEED, files.EVALUATION_SEED + count, envs.num_envs)
         begin = partial(trained.begin, trained.task, ())
         return joined((whole_outcome(envs, begin, seed) for seed in seeds), count)
 

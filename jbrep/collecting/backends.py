@@ -4,6 +4,7 @@ import math
 import pickle
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -17,7 +18,7 @@ from jbrep.dataset.schema import Columns
 from jbrep.envs.make import close_kept, is_batched
 from jbrep.envs.names import import_modules, imported_modules, spec_of
 from jbrep.envs.recording import Tick
-from jbrep.errors import InputError
+from jbrep.errors import InputError, first_line, refusing
 from jbrep.machine import cores
 from jbrep.pool import ATTEMPTS, side_by_side, stop_requested
 
@@ -45,7 +46,7 @@ def _can_be_sent(*parts: Any) -> bool:
     """
     try:
         return b"__main__" not in pickle.dumps(parts)
-    except (pickle.PicklingError, AttributeError, TypeError):
+    except Exception:  # some libraries raise their own
         return False
 
 
@@ -71,8 +72,11 @@ def _in_processes(simulator: Simulator, workers: int, spec: EnvSpec | None) -> P
             begin = piece.stop
             return piece
 
-        make = partial(make_episodes, known, simulator)
-        with closing(side_by_side(make, next_piece, workers, _PATIENCE)) as pieces:
+        make, what = partial(make_episodes, known, simulator), "other processes can't make episodes"
+        with (
+            refusing(f"{what}: try 1 of `threads`", (BrokenExecutor,), describe=first_line),
+            closing(side_by_side(make, next_piece, workers, _PATIENCE)) as pieces,
+        ):
             for piece, result in pieces:
                 if result is None:
                     raise InputError(

@@ -19,7 +19,6 @@ from jbrep.dataset.manifest import (
     new_manifest,
     read_manifest,
     shard_path,
-    write_manifest,
 )
 from jbrep.dataset.schema import EPISODES, DataSettings
 from jbrep.dataset.settings import MOST_SHARDS, SHARD_ROWS
@@ -93,13 +92,13 @@ def write_shards(
         if there.shards:
             check(wanted)
         if not wanted.complete:
-            return _fill(Growth(folder, wanted), produce, folder.name)
+            return _fill(Growth(folder, wanted), produce, folder.name, there)
         if wanted != there:
-            write_manifest(folder, wanted)
+            wanted.write(folder / MANIFEST)
     return wanted
 
 
-def _fill(growth: Growth, produce: Produce, name: str) -> Manifest:
+def _fill(growth: Growth, produce: Produce, name: str, there: Manifest) -> Manifest:
     begun, total = growth.rows, growth.manifest.settings.steps
     options: dict[str, Any] = {"unit": "step", "unit_scale": True, "desc": name}
     with Progress(total=total, initial=begun, **options) as progress:
@@ -110,7 +109,7 @@ def _fill(growth: Growth, produce: Produce, name: str) -> Manifest:
         except DamageError:
             raise
         except InputError as error:
-            kept = growth.manifest
+            kept = max(there, growth.manifest, key=lambda manifest: manifest.rows)
             if not kept.shards:
                 raise
             episodes = counted(kept.episodes, "episode")
@@ -138,7 +137,7 @@ def _begin(wanted: Manifest, folder: Path, files: Mapping[str, bytes]) -> Manife
         elif (folder / name).read_bytes() != content:
             raise InputError(f"{folder / name} is another policy's file: choose another folder")
     if there is wanted:
-        write_manifest(folder, wanted)
+        wanted.write(folder / MANIFEST)
     return there
 
 

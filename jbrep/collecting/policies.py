@@ -209,7 +209,20 @@ class UserPolicy:
 
     @classmethod
     def of(cls, policy: Any) -> "UserPolicy":
-        """A function, class or model itself."""
+        """A function, class or model itself.
+
+        Of a model its network is played, so it must see and do what the task says, unscaled.
+        """
+        if hasattr(policy, "get_vec_normalize_env"):
+            from jbrep.encoders.vec_env import JitterbugVecEnv
+
+            bare = getattr(policy.get_env(), "unwrapped", None)
+            is_ours = isinstance(bare, JitterbugVecEnv) or hasattr(policy, "action_repeat")
+            if is_ours or policy.get_vec_normalize_env():
+                raise InputError(
+                    "the model learned on scaled observations or actions: give a run's folder, or "
+                    "a function that scales both as its training did"
+                )
         acting = getattr(policy, "policy", policy) if hasattr(policy, "predict") else policy
         if not (callable(acting) or hasattr(acting, "predict")):
             raise InputError(

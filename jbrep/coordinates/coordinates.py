@@ -159,6 +159,7 @@ class Coordinates:
     def _steps_back(self) -> Iterator["_Step | str"]:
         """Steps that lead from coordinates to features; the name of a feature sets it to 0."""
         known = {*self.names}
+        turned = {n for part in self.parts if part.name.endswith(".heading") for n in part.of}
         steps = [_Step(part, is_inverse) for part in self.parts for is_inverse in (True, False)]
         while missing := [name for name in self.task.feature_names if name not in known]:
             before = len(known)
@@ -167,8 +168,11 @@ class Coordinates:
                     yield step
                     known.update(step.gives)
             if len(known) == before:
-                yield missing[0]
-                known.add(missing[0])
+                lost = min(
+                    missing, key=lambda name: name not in turned
+                )  # others may follow from it
+                yield lost
+                known.add(lost)
 
     @cached_property
     def features(self) -> tuple[Feature, ...]:

@@ -47,6 +47,8 @@ def make_coordinates(
             f"{task.name} has no feature that says where its robot is in the world or how it is "
             "turned, so symmetry has nothing to leave out: use coordinates"
         )
+    if not made.names:
+        raise InputError(f"{system} of {task.name} leaves nothing: use coordinates")
     if made.names == task.feature_names:
         raise InputError(
             f"{system} of {task.name} would be the observation: declare kinds of its features, "
@@ -90,7 +92,8 @@ class _Maker:
         self, name: str, formula: Any, of: _Names, shown: bool = True, soft: float = 0
     ) -> _Names:
         part = Part(name=name, formula=formula, of=of, shown=shown, soft=soft)
-        while formula != "same" and {*part.gives} & {*self._task.feature_names}:
+        taken = {*self._task.feature_names, *(name for each in self._parts for name in each.gives)}
+        while formula != "same" and {*part.gives} & taken:
             part = part.replace(name=f"{part.name}.{formula}")
         self._parts.append(part)
         return part.gives

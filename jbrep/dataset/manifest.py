@@ -143,11 +143,6 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
-def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write it in place of the previous one."""
-    manifest.write(folder / MANIFEST)
-
-
 def shard_path(folder: Path, shard: int) -> Path:
     """The file of a shard."""
     return folder / f"shard-{shard:05d}.h5"
@@ -180,7 +175,7 @@ def open_shard(folder: Path, manifest: Manifest, shard: int, *, known: bool = Fa
     if not known and hashlib.sha256(content).hexdigest() != entry.sha256:
         raise DamageError(f"{path} is damaged: its SHA-256 isn't the manifest's; {AGAIN}")
     columns = dict[str, NDArray[Any]]()
-    errors = (LookupError, TypeError, ValueError)
+    errors = (LookupError, OverflowError, TypeError, ValueError)
     with refusing(f"{path} is damaged: a column isn't in it", errors, kind=DamageError):
         for name, spec in manifest.settings.specs().items():
             shape = (entry.episodes if name.startswith(EPISODES) else entry.rows, *spec.row)
@@ -210,13 +205,16 @@ def shard_image(manifest: Manifest, shard: int, columns: Columns) -> tuple[Entry
 def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
     """Write the next shard, then the manifest that lists it, which is returned."""
     path = shard_path(folder, len(manifest.shards))
-    if exists(path):  # the last shard, with fewer episodes: from now on it doesn't count
-        write_manifest(folder, manifest)
     entry, image = shard_image(manifest, len(manifest.shards), columns)
-    write_whole(path, image)
-    manifest = manifest.replace(shards=(*manifest.shards, entry))
-    write_manifest(folder, manifest)
-    return manifest
+    grown = manifest.replace(shards=(*manifest.shards, entry))
+
+    def ready() -> None:
+        if exists(path):  # the same shard with fewer episodes, which counted until now
+            manifest.write(folder / MANIFEST)
+
+    write_whole(path, image, ready)
+    grown.write(folder / MANIFEST)
+    return grown
 
 
 def find_problems(folder: Path) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Reading a data set."""
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,11 +18,15 @@ from jbrep.dataset.manifest import check_sizes, open_shard, read_manifest
 from jbrep.dataset.scaling import EXTREMA, Scaler, extrema, fit_scaler, mean_and_std
 from jbrep.dataset.schema import Columns, episode_bounds, episode_columns
 from jbrep.dataset.settings import policy_text
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError
 from jbrep.text import Table, counted, facts, number
 
 _OPEN_SHARDS = 100  # memory-mapped at a time, at most: each takes a file descriptor
 _AHEAD = 8  # shards that are checked at a time, at most
+_RETURNS = (
+    "median {median:z,.1f} [10 % {p10:z,.1f}, 90 % {p90:z,.1f}], mean {mean:z,.1f}, "
+    "from {min:z,.1f} to {max:z,.1f}"
+)
 _RANGES = ("feature", "unit", "min", "mean", "max", "std", "usual range")
 
 
@@ -97,7 +101,12 @@ class Dataset:
             unknown = [k for k in range(shard, len(self._ends)) if k not in self._known]
             with ThreadPoolExecutor() as pool:
                 list(pool.map(check, unknown[:_AHEAD]))
-        return open_shard(self.folder, self.manifest, shard, known=shard in self._known)
+        try:
+            return open_shard(self.folder, self.manifest, shard, known=shard in self._known)
+        except DamageError:
+            if read_manifest(self.folder) == self.manifest:
+                raise
+            raise InputError(f"{self.folder} was extended meanwhile: open it again") from None
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -256,7 +265,7 @@ class Dataset:
             "seed": "-" if self.manifest.settings.is_imported else str(about["seed"]),
             "rows": f"{about['rows']:,}{unfinished}",
             "episodes": episodes,
-            "return": _spread_text(returns) if returns else "not known",
+            "return": _RETURNS.format(**returns) if returns else "not known",
             "columns": ", ".join(about["columns"]),
             "files": f"{counted(about['shards'], 'shard')}, {about['bytes'] / 1e6:,.1f} MB",
             "made with": ", ".join(f"{name} {what}" for name, what in about["versions"].items()),
@@ -270,14 +279,6 @@ class Dataset:
             named["note"] = note
         text = f"{self.folder}\n{facts(named, width)}"
         return f"{text}\n\n{Table('', _RANGES, rows).text(width)}" if rows else text
-
-
-def _spread_text(values: Mapping[str, float]) -> str:
-    shown = {name: number(value, ",.1f") for name, value in values.items()}
-    return (
-        f"median {shown['median']} [10 % {shown['p10']}, 90 % {shown['p90']}], mean "
-        f"{shown['mean']}, from {shown['min']} to {shown['max']}"
-    )
 
 
 def _spread(values: Any) -> dict[str, float]:

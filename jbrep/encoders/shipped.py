@@ -1,6 +1,7 @@
 """Encoders by name: those that ship with the package, and those that need no data."""
 
 import inspect
+import warnings
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +18,7 @@ from jbrep.encoders.encoder import SUFFIX, Encoder, load
 from jbrep.encoders.header import FULL, HELD_OUT_MSE, EncoderHeader, EncoderName
 from jbrep.envs.names import code_named, is_code
 from jbrep.envs.task import Task
-from jbrep.errors import InputError, refusing
+from jbrep.errors import InputError, Notice, refusing
 from jbrep.records.storage import exists
 
 _FOLDER = Path(__file__).parent / "shipped"
@@ -79,6 +80,10 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
         return unlearned(task, str(name))
     encoder = load(_path(name, task))
     encoder.check_task(task)
+    header = encoder.header
+    done, planned = (each.get("epochs") for each in (header.metrics, header.training))
+    if done and planned and done < planned:
+        warnings.warn(f"{name} is of {done} epochs of {planned} so far", Notice, stacklevel=2)
     return encoder
 
 

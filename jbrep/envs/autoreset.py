@@ -128,7 +128,7 @@ class AutoresetEnvironments:
             )
 
     def _start(self, indices: Sequence[int]) -> Array:
-        self._begun[indices] = len(self._taken)
+        self._begun[indices], self._reward[indices] = len(self._taken), 0.0
         oldest = int(self._begun.min())
         del self._taken[:oldest]
         self._begun -= oldest

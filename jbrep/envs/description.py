@@ -2,7 +2,7 @@
 
 import json
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,8 @@ def describe(
         action_bounds: of all numbers of an action, (-1, 1) or "-1..1", or of each: "-1..1,0..5".
             Within the environment's own; they must be given where that has none.
     """
-    name, made_with = taken_for(name)
+    name, made_with, limit = taken_for(name)
+    episode_steps = limit if episode_steps is None else episode_steps
     spec, given = find_spec(name), absolute({**made_with, **(env or {})})
     if "max_episode_steps" in given:
         raise InputError(
@@ -68,13 +69,18 @@ def describe(
     every = {**spec.kwargs, **given}
     files = files_of(every)
     registered = spec.max_episode_steps, spec.reward_threshold, repr(spec.kwargs)
-    key = (spec.entry_point, registered, tuple(files.items()))
-    task, signals = _describe(name, json.dumps(given, sort_keys=True), episode_steps, bounds, key)
+    with refusing(f"can't make {spec.id}"):
+        maker = creator(spec)
+    key = (maker, tuple(code_of(maker).items()), registered, tuple(files.items()))
+    with refusing("`env` must be plain JSON, such as text and numbers"):
+        arguments = json.dumps(given, sort_keys=True)
+    task, signals = _describe(name, arguments, episode_steps, bounds, key)
     now = files_of(every)  # the environment may write one of them, such as a log
     kept = {file: digest for file, digest in files.items() if now.get(file) == digest}
-    if own := kept | code_of(creator(spec)):
+    if own := kept | code_of(maker):
         task = task.replace(files=own)
     task = with_features(task, features) if features is not None else task
+    hide = (hide,) if isinstance(hide, str) else hide
     for problem in precision_problems(task, signals):
         warnings.warn(problem, Notice, stacklevel=2)
     task = task.replace(missing=missing) if missing else task
@@ -88,10 +94,10 @@ def as_task(given: Any) -> Task:
 
 def read_bounds(given: Bounds | str | None) -> Bounds:
     """Bounds of actions as people write them: "-1..1", or "-1..1,0..5", one for each number."""
-    parts: Any = given or ()
+    parts: Any = given.tolist() if isinstance(given, np.ndarray) else given or ()
     if isinstance(parts, str):
         parts = [each.split("..") for each in parts.split(",")]
-    elif parts and np.ndim(parts) == 1:
+    elif parts and not any(isinstance(each, Sequence) for each in parts):
         parts = [parts]
     return converted(parts, Bounds, "action_bounds", strict=False)
 

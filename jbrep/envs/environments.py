@@ -46,6 +46,8 @@ class Retries:
     """How often what fails is tried again, in a row."""
 
     def __init__(self, most: int = 0):
+        if most < 0:
+            raise InputError(f"`retries` is {most}: it must be at least 0")
         self._most = self._left = most
 
     def failed(self, error: Exception) -> None:
@@ -190,7 +192,8 @@ class Environments:
         mask = np.isin(np.arange(self.num_envs), indices)
         observation, info = self._batch.reset(seed=every, options={"reset_mask": mask})
         self._check(observation, np.zeros(self.num_envs), "reset gave")
-        self._see(observation, info)
+        self.observation, self.info = observation, info
+        self.arrays = {name: info[name] for name in self._names}
         return observation
 
     def step(self, actions: ArrayLike) -> Step:
@@ -238,10 +241,6 @@ class Environments:
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-    def _see(self, observation: Array, info: Mapping[str, Any]) -> None:
-        self.observation, self.info = observation, info
-        self.arrays = {name: info[name] for name in self._names}
 
     def _count(self) -> None:
         self.active = ~(self.terminated | self.truncated)
@@ -309,6 +308,7 @@ class Separate:
         self, seed: Sequence[int | None], options: Mapping[str, Flags]
     ) -> tuple[Array, dict[str, Array]]:
         self._make_new_arrays()
+        self._reward = self._reward.copy()
         for index in np.flatnonzero(options["reset_mask"]).tolist():
             self._begin(index, seed[index])
         return self._observation, self._arrays

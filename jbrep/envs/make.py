@@ -26,7 +26,7 @@ from jbrep.envs.domain import Domain
 from jbrep.envs.isolation import isolated
 from jbrep.envs.names import INSTANCE, files_of, find_spec, spec_of
 from jbrep.envs.task import Task
-from jbrep.errors import Notice, kind_and_line, refusing
+from jbrep.errors import InputError, Notice, kind_and_line, refusing
 
 Env = gymnasium.Env[Any, Any]
 Flatten = Callable[[Any], NDArray[Any]]
@@ -158,9 +158,11 @@ def take(
     domain: Domain | None = None,
 ) -> Env:
     """An environment to use: the one that is kept, if it is the same, or else a new one."""
+    if env_id.startswith(INSTANCE) and any(each.key[0] == env_id for each in _used.values()):
+        raise InputError(f"{env_id} exists once, and is in use")
     spec = find_spec(env_id)
     given = {**spec.kwargs, **arguments}
-    key = spec.id, spec.entry_point, repr(given), domain
+    key = spec.id, creator(spec), repr(given), domain
     limit = max_episode_steps or spec.max_episode_steps
     bare = _take_kept(key, given)
     if bare is None:

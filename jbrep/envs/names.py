@@ -147,35 +147,41 @@ def name_given(text: str) -> str:
 # environments that no id is registered for
 
 
-def taken_for(given: Any) -> tuple[str, dict[str, Any]]:
-    """The id of what is given for a task, and the arguments that it was made with.
+def taken_for(given: Any) -> tuple[str, dict[str, Any], int | None]:
+    """The id of what is given for a task, the arguments and the time limit that it was made with.
 
     A class is registered as MODULE/CLASS; an instance that `gymnasium.make` didn't make, or that
     has more wrappers, is this process's alone.
     """
     if isinstance(given, str):
-        return given, {}
+        return given, {}, None
     if isinstance(given, type) and issubclass(given, gymnasium.Env):
         module, name = given.__module__, f"{given.__module__.replace('.', '-')}/{given.__name__}"
         if module not in (*_imported, "__main__"):  # other processes import it, too
             _imported.append(module)
-        return _registered(name, given), {}
+        if "<locals>" in given.__qualname__:  # a function may make several of that name
+            name = _numbered(name, given)
+        return _registered(name, given), {}, None
     if not isinstance(given, gymnasium.Env):
         raise InputError(f"the task is {given!r}: it must be a name, a Task or an environment")
     made = given.spec
     if made and made.id in gymnasium.registry and not made.additional_wrappers:
         usual = {**gymnasium.spec(made.id).kwargs, "render_mode": made.kwargs.get("render_mode")}
         differing = {n: v for n, v in made.kwargs.items() if n not in usual or usual[n] != v}
-        return made.id, differing
-    kind = f"{INSTANCE}{type(given.unwrapped).__name__}"
-    names = (f"{kind}-{number}" if number else kind for number in count())
-    name = next(each for each in names if _instances.setdefault(each, given) is given)
+        return made.id, differing, made.max_episode_steps
+    name = _numbered(f"{INSTANCE}{type(given.unwrapped).__name__}", given)
     lent = _Lent(given)
     limit = made.max_episode_steps if made else None
-    return _registered(name, lambda: lent, limit), {}
+    return _registered(name, lambda: lent, limit), {}, None
 
 
-_instances: dict[str, gymnasium.Env[Any, Any]] = {}  # of users, by their ids
+_locals: dict[str, Any] = {}  # users' instances and classes that no module names, by their ids
+
+
+def _numbered(name: str, given: Any) -> str:
+    """A name that is that thing's alone, with a number if another has it."""
+    names = (f"{name}-{number}" if number else name for number in count())
+    return next(each for each in names if _locals.setdefault(each, given) is given)
 
 
 def _registered(name: str, maker: Any, limit: int | None = None) -> str:

@@ -183,11 +183,6 @@ class Motion:
         """Positions of the joints, (n, nq)."""
         return self.arrays["qpos"]
 
-    @property
-    def qvel(self) -> Array:
-        """Velocities of the joints, (n, nv)."""
-        return self.arrays["qvel"]
-
     def put(self, data: mujoco.MjData, state: int) -> None:
         """Set a data object to one of the states; nothing is computed from it."""
         for name, values in self.arrays.items():

@@ -1,6 +1,7 @@
 """What an environment shows when it is played: its task, as far as that can be seen."""
 
 import math
+import random
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
@@ -67,7 +68,10 @@ def _task_of(
     action = _checked_action(env_id, env.action_space)
     features = [*features_of(env_id, env.observation_space)]
     spec = find_spec(env_id)
-    episodes = [[*_play(env, seed, _STEPS)] for seed in (0, 1, 0)]  # a fresh instance, a used one
+    episodes = [[*_play(env, seed, _STEPS)] for seed in (0, 1)]  # a fresh instance, a used one
+    own = random.getstate()
+    episodes.append([*map(_beside_others, _play(env, 0, _STEPS))])
+    random.setstate(own)
     limit = max_episode_steps or spec.max_episode_steps
     low, high = _bounds(action)
     timestep = number_of(getattr(env.unwrapped, "dt", None))
@@ -80,7 +84,7 @@ def _task_of(
         max_episode_steps=limit or _find_limit(env, env_id),
         arguments=dict(arguments),
         timestep=timestep if timestep and timestep > 0 else None,
-        solved_return=spec.reward_threshold,
+        solved_return=spec.reward_threshold if limit == spec.max_episode_steps else None,
         terminates=True if any(steps[-1].terminated for steps in episodes) else None,
         reproducible=_content(episodes[0]) == _content(episodes[2]),
         seed_bits=_seed_bits(env),
@@ -93,6 +97,13 @@ class _Step(NamedTuple):
     reward: float
     terminated: bool
     truncated: bool
+
+
+def _beside_others(step: _Step) -> _Step:
+    """A step, after which other environments draw from the process's generators."""
+    np.random.random()  # noqa: NPY002
+    random.random()
+    return step
 
 
 def _play(env: Env, seed: int, most: int, still: bool = False) -> Iterator[_Step]:

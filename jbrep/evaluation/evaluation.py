@@ -11,6 +11,7 @@ registered, so that a further diagnostic is a further function, such as
 
 import json
 from collections.abc import Callable, Iterable
+from math import isfinite
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 from msgspec import UNSET, UnsetType
@@ -221,5 +222,7 @@ def measured(judged: Judged) -> Scores:
     for measure, names in _REGISTERED:
         found = measure(judged)
         several = (found,) if len(names) == 1 else found
-        scores |= {name: s for name, s in zip(names, several, strict=True) if s is not None}
+        for name, score in zip(names, several, strict=True):
+            if score is not None:  # JSON has no NaN
+                scores[name] = Score(*(v if v is not None and isfinite(v) else None for v in score))
     return scores

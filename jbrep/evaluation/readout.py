@@ -32,8 +32,10 @@ def latent_units(encoder: BaseEncoder, held_out: HeldOut) -> LatentUnits:
     values = np.concatenate(parts).astype(np.float64)
     deviation = values.std(axis=0)
     live = deviation > max(_DEAD * deviation.max(), _STILL)
-    spectrum = np.linalg.eigvalsh(np.atleast_2d(np.cov(values.T)))
-    ratio = float(spectrum.sum() ** 2 / np.square(spectrum).sum()) if live.any() else None
+    ratio = None
+    if live.any():
+        spectrum = np.linalg.eigvalsh(np.atleast_2d(np.cov(values.T)))
+        ratio = float(spectrum.sum() ** 2 / np.square(spectrum).sum())
     return LatentUnits(
         mean=values.mean(axis=0).tolist(),
         variance=(deviation**2).tolist(),

@@ -297,11 +297,6 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         """What pictures follow from: arrays of `mujoco.MjData`, (n, ...) each."""
         return self.simulation.mujoco_state
 
-    def look(self) -> Array:
-        """The observations, (n, d), once the simulation was brought to other states."""
-        self._observation = self.simulation.observe()
-        return self._observation
-
     def push(self, velocity: Array) -> None:
         self.simulation.push(velocity)
 

@@ -20,9 +20,10 @@ from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader, check_name
 from jbrep.encoders.layers import dense, run
 from jbrep.envs.task import Array
 from jbrep.errors import InputError, differences
-from jbrep.methods.linear import DEVIATION, held_out_error, inverse_root
+from jbrep.methods.linear import DEVIATION, held_out_error
 from jbrep.methods.registry import get_method, name_of
 from jbrep.records.commit import commits
+from jbrep.records.record import to_plain
 from jbrep.records.storage import exclusive, exists, make_folder
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method
 from jbrep.training.objective import Layers
@@ -225,7 +226,8 @@ def _header(method: Method, name: str, data: ScaledDataset) -> EncoderHeader:
 
 def _origin(header: EncoderHeader) -> dict[str, Any]:
     """What must be equal for two encoders of one name to be the same."""
-    of = {"kind": header.kind, "task": header.environment.name}
+    task = header.environment
+    of = {"kind": header.kind, "task": task.name, "features": to_plain(task.features)}
     return {**USUAL, **header.training, **of, "data": header.data.get("fingerprint")}
 
 
@@ -272,12 +274,11 @@ def _rescaled(
 ) -> tuple[Layers, Layers]:
     """The same code with standard deviation 1/3 in each unit, uncorrelated if it is to be white."""
     mean, covariance = moments
+    axes, variance = np.eye(len(mean)), np.diag(covariance)
     if codes == "white":
-        scale = DEVIATION * inverse_root(covariance, "the code")
-    else:
-        variance = np.diag(covariance)
-        varies = variance > _NEGLIGIBLE
-        scale = np.diag(np.where(varies, DEVIATION / np.sqrt(np.where(varies, variance, 1)), 1))
+        variance, axes = np.linalg.eigh(covariance)
+    varies = variance > _NEGLIGIBLE
+    scale = axes * np.where(varies, DEVIATION / np.sqrt(np.where(varies, variance, 1)), 1) @ axes.T
     return _after(encoder, scale, -scale @ mean), _before(decoder, np.linalg.inv(scale), mean)
 
 

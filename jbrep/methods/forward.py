@@ -50,6 +50,7 @@ class LinearForward(Directions, frozen=True, kw_only=True):
     C^(-1/2) (x - mean), of the first left singular vectors U of C^(1/2) B; its units have standard
     deviation 1/3. The spectrum is that of the singular values.
 
+    Where actions follow from the state, those after a horizon tell of it: the code isn't the best.
     It takes one pass over the windows; over a sample of them where rows are wide, see `blocks`.
     """
 

@@ -50,16 +50,6 @@ def signed(weight: Array) -> Array:
     return weight * np.sign(np.take_along_axis(weight, largest, axis=1))
 
 
-def inverse_root(covariance: Array, what: str) -> Array:
-    """C^(-1/2) of a covariance (n, n)."""
-    variances, vectors = np.linalg.eigh(covariance)
-    if not variances[0] > _NEGLIGIBLE * variances[-1]:
-        raise InputError(
-            f"the covariance of {what} is singular: some are constant or depend on others linearly"
-        )
-    return (vectors / np.sqrt(variances)) @ vectors.T
-
-
 def direction_code(directions: Array, moments: Moments, spectrum: Array) -> Made:
     """The linear code of directions (l, d) of any length, each unit with standard deviation 1/3.
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from jbrep.dataset import ScaledDataset
-from jbrep.encoders.layers import Layer, dense
+from jbrep.encoders.layers import MAX_UNITS, Layer, dense
 from jbrep.envs.task import Array
 from jbrep.errors import InputError
 from jbrep.training.method import Learned
@@ -37,6 +37,12 @@ class OFE(Learned, frozen=True, kw_only=True):
             raise InputError(
                 f"latent size is {self.latent}: with {data.size} features, which are part of the "
                 f"code, and {self.blocks} blocks it must be at least {data.size + self.blocks}"
+            )
+        width = (self.latent - data.size) // self.blocks  # of the last, which doubles what it takes
+        if (most := 2 * self.latent - width) > MAX_UNITS:
+            raise InputError(
+                f"latent size is {self.latent}: a layer would have {most:,} units, at most "
+                f"{MAX_UNITS:,} are possible"
             )
 
     def objective(self, data: ScaledDataset) -> Objective:

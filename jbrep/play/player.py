@@ -9,7 +9,7 @@ import numpy as np
 from jbrep.encoders import FULL
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.environments import Environments, envs_at_once
-from jbrep.envs.make import is_batched
+from jbrep.envs.make import is_batched, is_one_robot
 from jbrep.envs.physics import MotionReader
 from jbrep.envs.recording import Actor, Outcome, Recording, joined, record, whole_outcome
 from jbrep.envs.task import Array, Task
@@ -42,7 +42,7 @@ class Player(NamedTuple):
             episodes: their numbers, from 0.
             begun: what is done to them before their first step.
         """
-        if len(episodes) > 1 and not self.task.reproducible:  # a robot may exist once
+        if len(episodes) > 1 and (not self.task.reproducible or is_one_robot(self.task, None)):
             return [each for episode in episodes for each in self.play([episode], begun)]
         seeds = [EVALUATION_SEED + episode for episode in episodes]
         act, read = self.begin(self.task, seeds), MotionReader()

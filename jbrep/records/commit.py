@@ -3,6 +3,7 @@
 import re
 import subprocess
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -27,7 +28,9 @@ def commits() -> Commits:
     That of a folder is the last one that changed a file there. "+changes" stands after it if files
     that git tracks differ from it. They are those of the first call in a process.
     """
-    places = {"jbrep": Path(__file__).resolve().parents[1], "work": Path.cwd()}
+    places = {"jbrep": Path(__file__).resolve().parents[1]}
+    with suppress(OSError):  # it may be deleted
+        places["work"] = Path.cwd()
     known = {name: _commit(folder) for name, folder in places.items()}
     return MappingProxyType({name: commit for name, commit in known.items() if commit})
 

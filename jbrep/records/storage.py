@@ -4,7 +4,7 @@ import os
 import shutil
 import socket
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from fnmatch import fnmatchcase
@@ -25,13 +25,18 @@ def read_file(path: Path) -> bytes:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file atomically: even after a power cut it has all its bytes or is as it was."""
+def write_whole(path: Path, content: bytes, ready: Callable[[], object] = lambda: None) -> None:
+    """Write a file atomically: even after a power cut it has all its bytes or is as it was.
+
+    `ready` is called when they are on the disk, before they take the place of others.
+    """
     partial = path.with_name(path.name + _PARTIAL)
     try:
         partial.unlink(missing_ok=True)
         with partial.open("xb") as file:
             file.write(content)
+        sync(partial)
+        ready()
         publish(partial, path)
     except OSError as error:
         reason = f"{error.strerror or error} ({len(content):,} bytes are needed)"

@@ -35,6 +35,7 @@ from jbrep.machine import cpu
 from jbrep.records.commit import commits
 from jbrep.records.storage import exclusive, exists, make_folder, read_file, write_whole
 from jbrep.records.tables import write_csv, write_rows
+from jbrep.rl import files
 from jbrep.rl.agent import (
     acting,
     evaluate,
@@ -46,25 +47,6 @@ from jbrep.rl.agent import (
     unchecked_distributions,
 )
 from jbrep.rl.checkpoint import Checkpoint, Saver, Standing, standing, vec_env
-from jbrep.rl.files import (
-    BEGINNING,
-    CHECKPOINT,
-    ENCODER,
-    EPISODES,
-    EVALUATIONS,
-    FAILED,
-    FINISHED,
-    INFOS,
-    OWN,
-    POLICY,
-    POLICY_ZIP,
-    RUN,
-    Episode,
-    Evaluation,
-    Info,
-    RunRecord,
-    read_run,
-)
 from jbrep.rl.history import ControlStepsLogger, History, Scalars
 from jbrep.rl.policy import Trained, fill_whole, pack_whole
 from jbrep.rl.policy_file import read
@@ -115,7 +97,7 @@ _ALONE = Session()
 
 def train(
     run: Run, folder: Path, session: Session = _ALONE, encoder: BaseEncoder | None = None
-) -> RunRecord:
+) -> files.RunRecord:
     """Train an agent and write its folder, unless the run has ended already.
 
     A run that was killed or stopped resumes from its checkpoint, to the same bits; a StoppedError
@@ -125,14 +107,15 @@ def train(
     encoder = encoder or run.find_encoder()
     if ended := standing_of(run, folder, encoder).ended:
         return ended
-    make_folder(folder, OWN)
+    make_folder(folder, files.OWN)
     with exclusive(folder), single_thread():
         now = standing_of(run, folder, encoder)  # another process may have trained it meanwhile
         if now.ended:
             return now.ended
         record = _train(_Job(run, folder, session, encoder, now.settings), now.resumes)
-        is_over = not session.keep_checkpoint or record.status == FAILED
-        if is_over and read_run(folder) == record:  # else that of fewer steps has its checkpoint
+        is_over = not session.keep_checkpoint or record.status == files.FAILED
+        # else that of fewer steps has its checkpoint
+        if is_over and files.read_run(folder) == record:
             drop_checkpoint(folder)
         return record
 
@@ -145,7 +128,7 @@ def standing_of(run: Run, folder: Path, encoder: BaseEncoder | None = None) -> S
 
 def drop_checkpoint(folder: Path) -> None:
     """Remove the checkpoint of a run that has ended, and not gone on since."""
-    (folder / CHECKPOINT).unlink(missing_ok=True)
+    (folder / files.CHECKPOINT).unlink(missing_ok=True)
 
 
 def versions_of(run: Run) -> dict[str, str]:
@@ -167,11 +150,11 @@ class _Job:
     settings: RunSettings
 
 
-def _train(job: _Job, resumes: bool) -> RunRecord:
+def _train(job: _Job, resumes: bool) -> files.RunRecord:
     checkpoint = Checkpoint.read(job.folder) if resumes else None
     history = checkpoint.header.history if checkpoint else History()
     if isinstance(job.encoder, Encoder):
-        save(job.encoder, job.folder / ENCODER)
+        save(job.encoder, job.folder / files.ENCODER)
     with _agent(job) as agent:
         if job.settings.begin_from:
             _begin(agent, job, is_new=not resumes)
@@ -195,10 +178,10 @@ def _agent(job: _Job) -> Iterator[BaseAlgorithm]:
 
 def _begin(agent: BaseAlgorithm, job: _Job, is_new: bool) -> None:
     """Give an agent the policy of the run that it begins from, of which its folder has a copy."""
-    path, sha256 = job.folder / BEGINNING, job.settings.begin_from
+    path, sha256 = job.folder / files.BEGINNING, job.settings.begin_from
     assert sha256 is not None
     if is_new:
-        source = read(Path(job.run.begin_from) / POLICY, sha256).path
+        source = read(Path(job.run.begin_from) / files.POLICY, sha256).path
         write_whole(path, read_file(source))
     policy = read(path, sha256)
     fill_whole(policy, agent.policy)
@@ -266,7 +249,7 @@ class _Progress(BaseCallback):
         for index in ended:
             info = self.locals["infos"][index]
             total, length = float(info["episode"]["r"]), info["control_steps"]
-            row = Episode(self._step, index, total, length, info.get("non_finite", False))
+            row = files.Episode(self._step, index, total, length, info.get("non_finite", False))
             self._history.episodes.append(row)
         if self._is_evaluation_due(bool(ended)):
             self._evaluate(self.locals["new_obs"])
@@ -332,14 +315,16 @@ def check_finite(agent: BaseAlgorithm) -> None:
         raise DivergedError("the policy's weights are not finite")
 
 
-def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | None) -> RunRecord:
+def _end(
+    agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | None
+) -> files.RunRecord:
     """Write the run's files; the policy of a run that failed isn't kept.
 
     Where a run went on after fewer steps and failed, what it had left by then stays.
     """
     folder, settings = job.folder, job.settings
-    keeps = failed is not None and exists(folder / RUN)
-    goes_on = job.session.keep_checkpoint and exists(folder / CHECKPOINT) and not keeps
+    keeps = failed is not None and exists(folder / files.RUN)
+    goes_on = job.session.keep_checkpoint and exists(folder / files.CHECKPOINT) and not keeps
     if isinstance(failed, EnvironmentFailedError) and goes_on:
         raise InputError(
             f"{failed}; the run in {folder} has a checkpoint: the same command goes on from it if "
@@ -352,16 +337,16 @@ def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | 
         )
         policy = pack_whole(trained)
     if keeps:
-        tables |= read_run(folder).tables
+        tables |= files.read_run(folder).tables
     else:
-        (folder / RUN).unlink(missing_ok=True)  # of fewer steps, before its files change
+        (folder / files.RUN).unlink(missing_ok=True)  # of fewer steps, before its files change
         tables |= write_tables(folder, history)
         if policy:
-            write_whole(folder / POLICY, policy)
-            write_whole(folder / POLICY_ZIP, policy_zip(agent))
+            write_whole(folder / files.POLICY, policy)
+            write_whole(folder / files.POLICY_ZIP, policy_zip(agent))
     steps = settings.control_steps(agent.num_timesteps)
-    record = RunRecord(
-        status=FAILED if failed else FINISHED,
+    record = files.RunRecord(
+        status=files.FAILED if failed else files.FINISHED,
         reason=f"after {steps:,} steps: {printable(str(failed))[: MAX_LINE // 2]}"
         if failed
         else None,
@@ -376,18 +361,20 @@ def _end(agent: BaseAlgorithm, job: _Job, history: History, failed: Exception | 
         policy_sha256=hashlib.sha256(policy).hexdigest() if policy else None,
     )
     if not keeps:
-        record.write(folder / RUN)  # last: the run has ended where it exists
+        record.write(folder / files.RUN)  # last: the run has ended where it exists
     return record
 
 
 def write_tables(folder: Path, history: History) -> dict[str, str]:
     """Write the tables of a run; their SHA-256 by name."""
     tables = {
-        EPISODES: write_rows(folder / EPISODES, history.episodes, Episode),
-        EVALUATIONS: write_rows(folder / EVALUATIONS, history.evaluations, Evaluation),
+        files.EPISODES: write_rows(folder / files.EPISODES, history.episodes, files.Episode),
+        files.EVALUATIONS: write_rows(
+            folder / files.EVALUATIONS, history.evaluations, files.Evaluation
+        ),
     }
     if history.infos:
-        tables[INFOS] = write_csv(folder / INFOS, Info._fields, history.infos)
+        tables[files.INFOS] = write_csv(folder / files.INFOS, files.Info._fields, history.infos)
     return tables
 
 

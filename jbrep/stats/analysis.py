@@ -23,11 +23,11 @@ from jbrep.stats.intervals import (
     unless_few,
     variance_ratio,
 )
-from jbrep.stats.labels import RepresentationResult, describe, median
+from jbrep.stats.labels import RepresentationResult, describe
 from jbrep.stats.pairs import Pair, paired
 from jbrep.stats.rules import Planned, Verdict
 from jbrep.stats.runs import Group, RunCurve, evaluated_run, groups
-from jbrep.stats.scale import STEPS_TO, Ends, best_blind, scale_of
+from jbrep.stats.scale import Ends, best_blind, scale_of
 
 References = Mapping[str, Mapping[str, Sequence[float]]]  # returns by task and policy
 SCORES = np.linspace(0, 1.2, 61)  # at which profiles are evaluated
@@ -198,14 +198,8 @@ def compare(
     found = paired(known, label.representation, baseline.representation)
     numbers = _differences(found, seed) if found else dict.fromkeys(_PAIRED, UNDEFINED)
     numbers["variance_ratio"] = unless_few(variance_ratio(*finals), *runs)
-    for name, statistic in (
-        ("variance_ratio_bootstrap", lambda x, y: x.var(axis=-1, ddof=1) / y.var(axis=-1, ddof=1)),
-        ("probability_of_improvement", probability_of_improvement),
-    ):
-        numbers[name] = percentile(statistic, *finals, seed=seed)
-    for name in STEPS_TO:
-        ratio = percentile(lambda x, y: median(x) / median(y), *pairs[name], seed=seed)
-        numbers[f"{name}_ratio"] = ratio
+    better = percentile(probability_of_improvement, *finals, seed=seed)
+    numbers["probability_of_improvement"] = better
     return Comparison(
         representation=label.representation,
         numbers=numbers,

@@ -74,7 +74,8 @@ def deviation(values: Array) -> Interval:
     with a kurtosis about a trimmed mean. It is NaN for fewer runs than FEWEST_RUNS, and where
     nothing varies.
     """
-    runs, value = len(values), values.std(ddof=1)
+    runs = len(values)
+    value = values.std(ddof=1) if runs > 1 else np.nan
     if runs < FEWEST_RUNS or constant(values):
         return Interval(value, np.nan, np.nan)
     quartic, squares = _moments(values)
@@ -152,10 +153,13 @@ def mean_within(values: Array, bounds: Bounds, level: float) -> Interval:
 
 
 def surely_above(values: Array, least: float, bounds: Bounds) -> bool:
-    """Whether a mean lies above a number: its interval does, or each of few values (n,)."""
+    """Whether a mean lies above a number: its intervals do, or each of few values (n,).
+
+    Student's interval must, too: the other never ends below the least possible return.
+    """
     if len(values) < FEWEST_RUNS or constant(values):
         return bool(values.min() > least)
-    return bool(mean_within(values, bounds, LEVEL).low > least)
+    return all(bool(mean_within(values, each, LEVEL).low > least) for each in (bounds, Bounds()))
 
 
 def share_of_gain(x: Array, y: Array, reference: float, level: float) -> Interval:

@@ -64,7 +64,7 @@ def describe(
     by_run = {
         "final_return": final,
         "mean_return": mean_return(curves, grid),
-        "gain": final_return(curves, grid) - curves[:, 0],
+        "gain": final_return(curves, grid) - scale.ends.blind_in_training,
         **{name: steps_to(curves, grid, each) for name, each in scale.thresholds.items()},
         "score": scale.ends.score(final),
         "rise": rise(curves, grid),
@@ -131,7 +131,7 @@ def components(returns: Array) -> tuple[Interval, Interval, Interval]:
     of_runs = Interval(
         within, *(within * freedom[1] / chi2.ppf(tail, freedom[1]) for tail in _TAILS)
     )
-    quotient = between / within if within else np.inf
+    quotient = between / within if within else np.inf if between else np.nan
     ratios = (quotient / f.ppf(tail, *freedom) for tail in _TAILS)
     ratio = (max((each - 1) / runs, 0.0) for each in (quotient, *ratios))
     below, above = _half_widths(between, within, freedom)

@@ -80,8 +80,9 @@ class Objective(nn.Module, ABC):
 def feature_weights(data: ScaledDataset, weights: Mapping[str, float]) -> Tensor | None:
     """A weight for each number of a scaled row, (size,); None where all are 1."""
     values = torch.ones(data.scaler.size)
-    for name, weight in weights.items():
-        places = data.scaler.places((name,), data.task)
+    found = {name: data.scaler.places((name,), data.task) for name in weights}
+    for name in sorted(found, key=lambda name: (-len(found[name]), name)):  # one over a pattern
+        places, weight = found[name], weights[name]
         if not set(places) & set(data.used):
             raise InputError(f"{name} passes around the encoder unchanged: it can't have a weight")
         values[places] = float(weight)

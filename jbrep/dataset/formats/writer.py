@@ -18,7 +18,7 @@ from jbrep.dataset.formats.episodes import Incoming, count_missing, single, with
 from jbrep.dataset.formats.frame import frame_of_table
 from jbrep.dataset.formats.source import LAST, Source
 from jbrep.dataset.layout import Layout
-from jbrep.dataset.manifest import Manifest, commit, new_manifest, range_problems, write_manifest
+from jbrep.dataset.manifest import MANIFEST, Manifest, commit, new_manifest, range_problems
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.rewards import reward_function, without_range
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
@@ -294,7 +294,7 @@ def _fill(
     source: Source, settings: DataSettings, folder: Path, rewards: Rewards | None
 ) -> Manifest:
     manifest, task = new_manifest(settings), settings.task
-    write_manifest(folder, manifest)
+    manifest.write(folder / MANIFEST)
     missing = task.missing or ""
     episodes = (each for whole in source.episodes() for each in without_missing(whole, missing))
     numbered = enumerate(episodes)
