@@ -72,9 +72,9 @@ def _in_processes(simulator: Simulator, workers: int, spec: EnvSpec | None) -> P
             begin = piece.stop
             return piece
 
-        make, what = partial(make_episodes, known, simulator), "other processes can't make episodes"
+        make, hint = partial(make_episodes, known, simulator), "try 1 of `threads`"
         with (
-            refusing(f"{what}: try 1 of `threads`", (BrokenExecutor,), describe=first_line),
+            refusing(f"other processes fail, {hint}", (BrokenExecutor,), describe=first_line),
             closing(side_by_side(make, next_piece, workers, _PATIENCE)) as pieces,
         ):
             for piece, result in pieces:

@@ -168,9 +168,8 @@ class Coordinates:
                     yield step
                     known.update(step.gives)
             if len(known) == before:
-                lost = min(
-                    missing, key=lambda name: name not in turned
-                )  # others may follow from it
+                # headings first, as others may follow from them
+                lost = min(missing, key=lambda name: name not in turned)
                 yield lost
                 known.add(lost)
 

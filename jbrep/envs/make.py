@@ -159,7 +159,7 @@ def take(
 ) -> Env:
     """An environment to use: the one that is kept, if it is the same, or else a new one."""
     if env_id.startswith(INSTANCE) and any(each.key[0] == env_id for each in _used.values()):
-        raise InputError(f"{env_id} exists once, and is in use")
+        raise InputError(f"{env_id} exists once, and is in use: for several, give its class")
     spec = find_spec(env_id)
     given = {**spec.kwargs, **arguments}
     key = spec.id, creator(spec), repr(given), domain
