@@ -17,13 +17,8 @@ from jbrep.rl.files import BEGINNING, POLICY, POLICY_ZIP, RUN, read_evaluations,
 from jbrep.rl.policy import load_run
 
 CART = describe(cart.ID)
-SETTINGS = {
-    "task": CART,
-    "algorithm": "sac",
-    "preset": "modern",
-    "evaluation_episodes": 2,
-    "final_episodes": 2,
-}
+SETTINGS = {"task": CART, "algorithm": "sac", "preset": "modern"}
+SETTINGS |= {"evaluation_episodes": 2, "final_episodes": 2}
 
 
 @pytest.fixture(scope="module")

@@ -33,16 +33,6 @@ def test_rows_are_the_episodes_of_a_random_policy(collected):
     assert dataset["action"][:].std() == pytest.approx(1 / np.sqrt(3), rel=0.02)
 
 
-def test_neither_environments_nor_threads_change_a_byte(tmp_path):
-    """A shard of two episodes and one of one."""
-    made = []
-    for how in ({}, {"num_envs": 1, "num_threads": 1}, {"num_envs": 3, "num_threads": 2}):
-        folder = tmp_path / f"{len(made)}"
-        collect(small.brief(steps=300, shard_episodes=2), folder, **how)
-        made.append(contents(folder))
-    assert made[0] == made[1] == made[2]
-
-
 @pytest.mark.parametrize(
     ("changes", "how", "named"),
     [
@@ -180,8 +170,8 @@ import_modules(["environments"])
 OPEN = "uniform:0.4+ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3:0.3+constant:drive=0.5:0.3"
 
 
-def mixed(task="face_direction"):
-    short = describe(task, episode_steps=60)
+def mixed():
+    short = describe("face_direction", episode_steps=60)
     policy = parse_policy(OPEN).settings()
     return settings(task=short, policy=policy, steps=600, shard_episodes=4)
 
@@ -206,9 +196,11 @@ def test_episodes_say_which_policy_acted_in_them(mixture):
     assert jbrep("data", "verify", mixture, "--replay", 2).exit_code == 0
 
 
-def test_neither_environments_nor_threads_change_a_byte_of_a_mixture(mixture, tmp_path):
-    collect(mixed(), tmp_path / "data", num_envs=3, num_threads=2)
-    assert contents(tmp_path / "data") == contents(mixture)
+def test_neither_environments_nor_threads_change_a_byte(mixture, tmp_path):
+    """Shards of four episodes and one of two."""
+    for envs, threads in ((1, 1), (3, 2)):
+        collect(mixed(), tmp_path / f"{envs}", num_envs=envs, num_threads=threads)
+        assert contents(tmp_path / f"{envs}") == contents(mixture)
 
 
 def test_in_processes_and_extended(tmp_path):

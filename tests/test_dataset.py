@@ -186,10 +186,6 @@ def test_a_shard_is_flat_columns_that_any_hdf5_tool_opens(collected):
         assert file["episodes/seed"][:].tolist() == [4 * 2**32 + 2]
 
 
-def test_a_sample_is_verified():
-    assert jbrep("data", "verify", "data/sample/move_to_pose", "--replay", 1).exit_code == 0
-
-
 def test_replayed_episodes_are_equal_bit_for_bit(collected):
     dataset = Dataset(collected)
     assert not list(replay_problems(dataset, 5, num_threads=1))

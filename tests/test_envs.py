@@ -22,13 +22,8 @@ FACE = environment_id("face_direction")
 
 
 def test_the_ids():
-    assert IDS == [
-        "Jitterbug/MoveFromOrigin-v0",
-        "Jitterbug/FaceDirection-v0",
-        "Jitterbug/MoveInDirection-v0",
-        "Jitterbug/MoveToPosition-v0",
-        "Jitterbug/MoveToPose-v0",
-    ]
+    names = ("MoveFromOrigin", "FaceDirection", "MoveInDirection", "MoveToPosition", "MoveToPose")
+    assert [f"Jitterbug/{name}-v0" for name in names] == IDS
 
 
 @pytest.mark.filterwarnings("ignore:.*-?infinity. This is probably too")  # no state is bounded

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from command import jbrep
 from sklearn.metrics import r2_score
+from test_controls import projection
 from wide import make_feature, make_task, wide
 
 from jbrep.dataset import ScaledDataset, Scaler
@@ -19,7 +20,6 @@ from jbrep.evaluation.evaluation import EVALUATION, Evaluation
 from jbrep.evaluation.held_out import MAX_NUMBERS, HeldOut, sample_rows
 from jbrep.evaluation.readout import every, latent_units
 from jbrep.evaluation.reconstruction import reconstruction
-from jbrep.methods.controls import Random
 from jbrep.methods.linear import principal_code
 from jbrep.records.document import read_document
 from jbrep.reporting.evaluation import evaluation_text
@@ -35,13 +35,9 @@ def held_out(data):
     return HeldOut(wide)
 
 
-def projection(data, latent, seed):
-    return Random(latent=latent, seed=seed).make(data)[:2]
-
-
-def make(scaled, parts, name="it-4", **changes):
+def make(scaled, parts, **changes):
     task = changes.pop("task", scaled.task)
-    header = EncoderHeader(kind="test", name=name, environment=task, **changes)
+    header = EncoderHeader(kind="test", name="it-4", environment=task, **changes)
     return Encoder(header, scaled.scaler, *parts)
 
 
@@ -55,10 +51,6 @@ def coder(held_out):
 def everything(held_out):
     """The scaled observation itself."""
     return make(held_out.data, ((), ()))
-
-
-def observed(held_out, part):
-    return held_out.data.dataset["observation"][getattr(held_out.data, part)]
 
 
 def test_intervals_cover_the_truth_as_often_as_they_say():
@@ -101,7 +93,7 @@ def test_sums_of_parts_are_those_of_the_whole(held_out):
 
 def test_errors_are_those_of_encode_and_decode(held_out, coder):
     result = reconstruction(coder, held_out)
-    rows = observed(held_out, "test")
+    rows = held_out.data.dataset["observation"][held_out.data.test]
     lost = coder.decode(coder.encode(rows)).astype(float) - rows
     scaled = lost / held_out.data.scaler.half_width
     assert result.mse[0] == pytest.approx(np.mean(scaled**2), rel=1e-5)

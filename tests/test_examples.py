@@ -19,7 +19,6 @@ import torch
 from command import in_this_process
 from small import ONE_EACH
 
-import jbrep
 from jbrep.envs.description import describe
 from jbrep.evaluation import regression
 from jbrep.play.sources import find_player
@@ -29,12 +28,8 @@ from jbrep.rl.policy_file import find_shipped
 from jbrep.studies.runner import BACKENDS
 
 OWN = Path("examples/own/own.py").resolve()
-ROBOT = Path("examples/robot").resolve()
 LOG = Path("examples/log/notebook.py").resolve()
-JUMP = Path("examples/jump").resolve()
 PAPER = Path("examples/paper/behaviour.py").resolve()
-SITE = Path("tools/site.py").resolve()
-
 
 LESS = {  # to do in own.py
     "steps = 240\nevaluate_every = 120": "steps = 80\nfinal_episodes = 2",
@@ -74,6 +69,7 @@ def test_everything_that_one_can_bring(tmp_path, monkeypatch, capfd):
 @pytest.mark.filterwarnings("ignore::jbrep.errors.Notice")
 def test_the_notebook_goes_from_a_log_to_a_controller(tmp_path, monkeypatch, capsys):
     """At toy size; and as a page it has all its cells."""
+    page_of = runpy.run_path("tools/site.py")["page_of"]
     monkeypatch.syspath_prepend(LOG.parent)
     monkeypatch.setattr(regression, "_STEPS", 50)
     monkeypatch.chdir(tmp_path)
@@ -85,7 +81,7 @@ def test_the_notebook_goes_from_a_log_to_a_controller(tmp_path, monkeypatch, cap
     assert "6 of 60 steps" in told
     assert "16 sensors, such as position_x; an action every 0.01 s" in told
     assert re.search(r"the clone returns [\d.]+, what it learned from [\d.]+", told)
-    page = runpy.run_path(str(SITE))["page_of"](code)
+    page = page_of(code)
     assert page.startswith("# From a log to a controller\n\nWhat a robot")
     assert page.count("```python\n") == code.count("# %%\n") == 7
 
@@ -93,7 +89,7 @@ def test_the_notebook_goes_from_a_log_to_a_controller(tmp_path, monkeypatch, cap
 @pytest.fixture
 def on_robot(monkeypatch, tmp_path):
     """The controller of a shipped policy, and a robot beside it."""
-    monkeypatch.syspath_prepend(ROBOT)
+    monkeypatch.syspath_prepend("examples/robot")
     export(load_policy(find_shipped(describe("face_direction"))), tmp_path / "it.onnx")
     controller, robot = import_module("controller"), import_module("robot")
     with controller.listen(0) as link:
@@ -146,7 +142,7 @@ def test_a_robot_is_stopped_where_its_sensors_cannot_be_believed(on_robot):
 
 def test_an_angle_with_and_without_its_jump(monkeypatch):
     """Two states on either side of the jump: one encoder tells them apart, the other doesn't."""
-    monkeypatch.syspath_prepend(JUMP)
+    monkeypatch.syspath_prepend("examples/jump")
     jump = import_module("jump")
     sides = torch.zeros(2, 16)
     sides[:, 3] = 1  # upright
@@ -179,9 +175,6 @@ def test_behaviour_of_policies_is_tabled_and_drawn(tmp_path, monkeypatch, capsys
     assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(30, abs=14)
     assert capsys.readouterr().out.count("mean place") == 4
     assert (tmp_path / "positions.png").stat().st_size > 1000
-
-
-TASK = jbrep.describe("Pendulum-v1", episode_steps=20)
 
 
 @pytest.mark.slow

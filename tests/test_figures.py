@@ -17,6 +17,7 @@ STEPS = np.arange(0, 50_001, 10_000)
 FINAL = {"full": 900, "dae-8": 500, "pca-4": 300}
 PLAYED = {"face_direction": {"scripted": [910.0, 950.0, 990.0]}}
 IN_TRAINING = {"face_direction": {"scripted": 950.0}}
+FACTS = {"total_steps": 50_000, "return_floor": 0, "reference": 0, "top": 950, "solved": 900}
 GROUPS = [("face_direction", "ddpg"), ("face_direction", "sac"), ("move_to_pose", "sac")]
 
 
@@ -28,15 +29,9 @@ def runs():
             for seed in range(3 if (task, label) == ("move_to_pose", "dae-8") else 4):
                 end = final + random.normal(0, 20)
                 returns = np.linspace(100, end, len(STEPS))[:, None] + random.normal(0, 5, (6, 3))
-                yield RunCurve(
-                    *(task, algorithm, label, seed, "s", STEPS, returns.clip(0, 1000)),
-                    total_steps=50_000,
-                    return_floor=0,
-                    reference=0,
-                    top=950,
-                    solved=900,
-                    failed_at=30_000 if (label, seed) == ("pca-4", 3) else None,
-                )
+                failed_at = 30_000 if (label, seed) == ("pca-4", 3) else None
+                given = (task, algorithm, label, seed, "s", STEPS, returns.clip(0, 1000))
+                yield RunCurve(*given, failed_at=failed_at, **FACTS)
 
 
 @pytest.fixture(scope="module")

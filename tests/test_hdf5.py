@@ -73,12 +73,6 @@ IN_DEMOS = {  # words of the line that refuses it: the place and the column
 }
 
 
-@pytest.mark.parametrize("words", IN_DEMOS)
-def test_what_is_wrong_in_a_demo_is_told_with_its_place(words, tmp_path):
-    told = not_imported(write_robomimic(tmp_path / "a.hdf5", damage=IN_DEMOS[words]))
-    assert all(word in told for word in words.split())
-
-
 IN_ROWS = {
     "25 observations 24 rewards": {"rewards": np.zeros(24)},
     "row 3 observations.1": {
@@ -89,7 +83,11 @@ IN_ROWS = {
 }
 
 
-@pytest.mark.parametrize("words", IN_ROWS)
-def test_what_is_wrong_in_rows_is_told_with_its_place(words, tmp_path):
-    told = not_imported(write_d4rl(tmp_path / "a.hdf5", **IN_ROWS[words]))
+@pytest.mark.parametrize("words", [*IN_DEMOS, *IN_ROWS])
+def test_what_is_wrong_in_a_file_is_told_with_its_place(words, tmp_path):
+    path = tmp_path / "a.hdf5"
+    if words in IN_DEMOS:
+        told = not_imported(write_robomimic(path, damage=IN_DEMOS[words]))
+    else:
+        told = not_imported(write_d4rl(path, **IN_ROWS[words]))
     assert all(word in told for word in words.split())

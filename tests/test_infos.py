@@ -104,12 +104,8 @@ def study(tmp_path_factory):
     """The folder of a tiny study, finished, and what its report says."""
     folder = tmp_path_factory.mktemp("infos") / "study"
     tiny = {"algorithms": ("a2c-paper",), "representations": ("full",), "seeds": (0, 1)}
-    tiny |= {
-        "steps": 40,
-        "evaluate_every": 40,
-        "evaluation_episodes": 1,
-        "final_episodes": EPISODES,
-    }
+    tiny |= {"steps": 40, "evaluate_every": 40}
+    tiny |= {"evaluation_episodes": 1, "final_episodes": EPISODES}
     plan = Plan(Study(tasks=(SCORED, "Sledges/Sledge-v0"), **tiny), folder)
     assert run_study(plan, in_this_process, 1) == 0
     draw = report.study_plots

@@ -10,12 +10,8 @@ TASK = "dm_control/pendulum-v0"
 STEPS = np.arange(0, 20_001, 2000)
 START = -1400.0  # the untrained policy's
 WORST = -1612.0  # of any episode: one of pca-1, in the middle of training
-LEVELS = {  # where runs of each representation end, and how far apart
-    "full": (-200, 8),
-    "dae-2": (-198, 1),
-    "dae-1": (-260, 8),
-    "pca-1": (-620, 60),
-}
+# where runs of each representation end, and how far apart
+LEVELS = {"full": (-200, 8), "dae-2": (-198, 1), "dae-1": (-260, 8), "pca-1": (-620, 60)}
 SEEDS = 12
 TOP = -150.0  # the return that scores 1, as a study's file gives it
 CLAIMS = (
@@ -40,9 +36,9 @@ def make(name, seed, level, speed=3000, **changes):
     )
 
 
-def study(levels=LEVELS):
+def study():
     """Runs of which one of dae-1 failed at step 9,000, and one of pca-1 before any evaluation."""
-    for name, (level, spread) in levels.items():
+    for name, (level, spread) in LEVELS.items():
         speed = 2000 if name == "dae-2" else 3000
         for seed, apart in enumerate(np.linspace(-1.6, 1.6, SEEDS)):
             changes = {"failed_at": 9000} if (name, seed) == ("dae-1", 5) else {}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from command import jbrep, mistake, refused
 from gymnasium.envs.registration import EnvSpec
-from small import assert_same_files
+from small import assert_same_files, stopping
 
 from jbrep.dataset import DataSettings
 from jbrep.envs import Environments, describe
@@ -19,14 +19,10 @@ from jbrep.envs.physics import put_factors, velocity_after
 from jbrep.envs.view import with_view
 from jbrep.play.perturbed import domains_of
 from jbrep.play.sources import find_player
-from jbrep.rl import Run, Session, StoppedError, train
+from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.files import EPISODES, EVALUATIONS, last_returns, read_evaluations, read_run
 
-TASKS = {
-    "face_direction": describe("face_direction", {}, 12),
-    "Hopper-v5": describe("Hopper-v5", {}, 12),
-    "Pendulum-v1": describe("Pendulum-v1", {}, 12),
-}
+TASKS = {name: describe(name, {}, 12) for name in ("face_direction", "Hopper-v5", "Pendulum-v1")}
 SEEDS = [7, 8, 9]
 NEUTRAL = {"noise": 0, "delay": 0, "dropped": 0, "action_delay": 0}
 SIGNALS = {"noise": "0..0.5", "delay": "0..2", "dropped": 0.3, "action_delay": "0..2"}
@@ -286,12 +282,6 @@ def test_the_command_shows_what_a_policy_keeps(tmp_path):
 
 DRAWN = {**BODIES, "delay": "0..2", "noise": "0..0.2", "push": "0..0.5"}
 SMALL = {"num_envs": 2, "net_arch": [8], "learning_starts": 20, "batch_size": 4}
-
-
-def stopping(step):
-    """A session that ends after so many steps."""
-    steps = [0]
-    return Session(lambda _, now: steps.append(now), stop=lambda: steps[-1] >= step)
 
 
 @pytest.fixture(scope="module")

@@ -103,8 +103,6 @@ def test_no_worker_outlives_its_parent(delay, tmp_path):
 
 def test_a_run_that_kills_its_workers_crashes_alone(monkeypatch):
     """Each run has five workers to lose."""
-    from jbrep.studies import runner
-
     monkeypatch.setattr(runner, "work", kill_worker_of_first_run)
     plan = SimpleNamespace(assigned=lambda name: SimpleNamespace(name=name))
     *others, crashed = runner.on_this_machine(plan, ("first", "second", "third"), 2)

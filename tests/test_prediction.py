@@ -14,19 +14,11 @@ from jbrep.encoders import Encoder, Layer
 from jbrep.encoders.header import EncoderHeader
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.evaluation import control, diagnose, regression
+from jbrep.evaluation import control, diagnose, prediction, regression
 from jbrep.evaluation.control import GoodPolicy, PlayedEpisode, lost, needs
 from jbrep.evaluation.diagnosis import networks
 from jbrep.evaluation.evaluation import Judged, Lost, Score
 from jbrep.evaluation.held_out import HeldOut, explained
-from jbrep.evaluation.prediction import (
-    Steps,
-    changes,
-    following,
-    prediction,
-    problems,
-    usual_horizons,
-)
 from jbrep.evaluation.readout import probes
 from jbrep.evaluation.regression import Networks, Problem, beside, fit
 from jbrep.evaluation.table import headline
@@ -71,9 +63,8 @@ class Cart:
         observations, rewards = [], []
         for step in range(STEPS + 1):
             observations.append(np.stack((place, speed, load, idle), 1).astype(np.float32))
-            speed = (
-                0.9 * speed - 0.1 * place + 0.3 * load * act(min(step, STEPS - 1), observations[-1])
-            )
+            push = act(min(step, STEPS - 1), observations[-1])
+            speed = 0.9 * speed - 0.1 * place + 0.3 * load * push
             place = place + 0.3 * speed
             idle = 0.95 * idle + 0.1 * random.normal(size=EPISODES)
             load = np.where(random.uniform(size=EPISODES) < 0.1, -load, load)
@@ -95,9 +86,9 @@ def controller(seen):
 def learning():
     """Steps and horizons enough for the cart."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jbrep.evaluation.prediction.HORIZONS", (1, 5, 10))
+        patch.setattr(prediction, "HORIZONS", (1, 5, 10))
         patch.setattr(regression, "_STEPS", 400)
-        patch.setattr("jbrep.evaluation.control._SHARE", 1.0)
+        patch.setattr(control, "_SHARE", 1.0)
         yield
 
 
@@ -221,21 +212,22 @@ def test_an_episodes_values_are_judged_by_what_was_fitted_to_others(held_out, po
 
 def test_actions_after_the_horizon_do_not_enter(held_out, monkeypatch):
     monkeypatch.setattr(regression, "_STEPS", 20)
-    steps, inputs = following(held_out, "train", 5), code(held_out.data, "speed")
+    steps, inputs = prediction.following(held_out, "train", 5), code(held_out.data, "speed")
     assert steps.inputs(inputs).shape == (len(steps.rows), 1 + 5)
     rows = held_out.data.dataset["action"]
     np.testing.assert_array_equal(steps.action[7], rows[steps.rows[7] : steps.rows[7] + 5].ravel())
-    before = prediction(inputs, held_out, networks(inputs, held_out).forward)
+    before = prediction.prediction(inputs, held_out, networks(inputs, held_out).forward)
     poisoned = ScaledDataset(Cart())
     last = np.arange(len(rows)) % STEPS >= STEPS - 1  # no window of 1 begins there
     poisoned.dataset.arrays["action"][last] = np.nan
     again = HeldOut(poisoned)
-    assert prediction(inputs, again, networks(inputs, again).forward)["1"] == before["1"]
+    after = prediction.prediction(inputs, again, networks(inputs, again).forward)
+    assert after["1"] == before["1"]
 
 
 def test_what_follows_is_of_the_same_episode(held_out):
     dataset = held_out.data.dataset
-    steps = following(held_out, "test", 20)
+    steps = prediction.following(held_out, "test", 20)
     assert (steps.rows % STEPS).max() == STEPS - 21
     assert set(steps.rows // STEPS) == set(held_out.numbers)
     observation, reward = dataset["observation"], dataset["reward"]
@@ -246,7 +238,7 @@ def test_what_follows_is_of_the_same_episode(held_out):
     short = ScaledDataset(Cart())
     short.dataset.episodes = {"length": np.full(1200, 10), "seed": np.arange(1200)}
     short.train, short.test = short.dataset.split()
-    assert usual_horizons(short) == [1, 5]
+    assert prediction.usual_horizons(short) == [1, 5]
 
 
 def test_r_squared_and_interval_by_episode(held_out):
@@ -283,7 +275,7 @@ def test_angles_change_by_all_that_they_turn():
     task = make_task([spin, make_feature("place")], "Top-v0")
     turned = np.array([0, 1, 2.5, 4, 7, 6, 4])
     rows = np.stack((wrapped(turned + 3), turned), axis=1).astype(np.float32)
-    found = changes(task, rows, np.array([0, 2]), 4)
+    found = prediction.changes(task, rows, np.array([0, 2]), 4)
     assert found == pytest.approx(np.array([[7, 7], [1.5, 1.5]]), abs=1e-5)
 
 
@@ -293,10 +285,11 @@ def test_a_rare_reward_is_learnt_beside_many_features(monkeypatch):
     near = np.clip(1 - 3 * np.hypot(seen[:, 0] - 1.5, seen[:, 1]), 0, None)  # in 2 % of rows
     moved = np.sin(2 * seen @ random.normal(size=(6, 20)))
     wanted = np.column_stack((moved, near)).astype(np.float32)
-    steps = Steps(np.arange(20_000), seen, np.zeros((20_000, 1)), wanted)
-    monkeypatch.setattr("jbrep.evaluation.prediction.usual_horizons", lambda _: [10])
+    steps = prediction.Steps(np.arange(20_000), seen, np.zeros((20_000, 1)), wanted)
+    monkeypatch.setattr(prediction, "usual_horizons", lambda _: [10])
     alone = SimpleNamespace(encode=lambda rows: rows)
-    (pair,) = problems(alone, SimpleNamespace(data=None, once=lambda *_: steps)).values()
+    known = SimpleNamespace(data=None, once=lambda *_: steps)
+    (pair,) = prediction.problems(alone, known).values()
     together = Problem(steps.inputs(alone), wanted)
     *apart, joint = fit([*pair, together])
     told = [r2_score(near, each(together.values)[:, -1]) for each in (beside(*apart), joint)]

@@ -20,7 +20,6 @@ from jbrep.methods.registry import get_method
 from jbrep.training.trainer import Trainer
 from jbrep.training.windows import Windows
 
-KINDS = ("forward", "self-prediction", "deepmdp")
 NOISY = 4  # features that nothing predicts
 TURN = 0.3  # [rad] of the hidden state in a step
 
@@ -77,7 +76,7 @@ def explained(code, wanted):
     return 1 - residual.var(axis=0) / wanted.var(axis=0)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["forward", "self-prediction", "deepmdp"])
 def test_every_parameter_learns_and_the_loss_falls(data, kind):
     settings = {"inverse": 0.5, "horizons": (1, 5)} if kind == "forward" else {}
     objective, history = train(data, kind, 4, latent=3, **settings)
@@ -210,19 +209,14 @@ def walks():
     return made
 
 
-def within(walks, horizon):
-    """Rows of the training part that have so many more in their episode, one by one."""
-    ends = np.cumsum(LENGTHS)
-    return [row for row in walks.train if row + horizon < ends[np.sum(ends <= row)]]
-
-
 @pytest.mark.parametrize("horizon", [0, 6, 20])
 def test_windows_lie_within_episodes_and_have_the_data_sets_numbers(walks, horizon):
     windows = Windows(walks, walks.train, horizon)
-    first = np.array(within(walks, horizon))
+    ends = np.cumsum(LENGTHS)
+    first = [row for row in walks.train if row + horizon < ends[np.sum(ends <= row)]]
     assert len(windows) == len(first)
     order = np.random.default_rng(0).permutation(len(first))
-    numbers, rows = torch.from_numpy(order), first[order]
+    numbers, rows = torch.from_numpy(order), np.array(first)[order]
     arrays = walks.dataset.arrays
     for ahead in {0, horizon}:
         expected = walks.scale(arrays["observation"][rows + ahead])

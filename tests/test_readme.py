@@ -16,7 +16,6 @@ from jbrep.rl.files import read_run
 from jbrep.studies.runner import BACKENDS
 
 ROOT = Path(__file__).parent.parent
-SMALL = {"--evaluation-episodes": "1", "--set": "net_arch=[16]"}
 EPISODES = {"--evaluation-episodes": "1", "--final-episodes": "1"}
 LESS = {  # by command: numbers in place of a page's, or beside them
     "check": {"--steps": "1k"},
@@ -26,13 +25,8 @@ LESS = {  # by command: numbers in place of a page's, or beside them
     "rl": {"--steps": "200", "--episode-steps": "100", **EPISODES},
     "clone": {"--steps": "50", "--episodes": "2"},
 }
-STUDY = {
-    "seeds": "1",
-    "steps": "100",
-    "evaluate_every": "100",
-    "evaluation_episodes": "1",
-    "final_episodes": "2",
-}
+STUDY = {"seeds": "1", "steps": "100", "evaluate_every": "100"}
+STUDY |= {"evaluation_episodes": "1", "final_episodes": "2"}
 MY_ROBOT = """
 import gymnasium
 

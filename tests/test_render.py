@@ -41,36 +41,20 @@ def render(*arguments):
     return jbrep("render", *small, *arguments)
 
 
-def read_mp4(path):
-    """Its frames, and what a browser asks of it."""
-    import av
-
-    with av.open(str(path)) as container:
-        (stream,) = container.streams.video
-        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
-        codec = stream.codec_context
-        return frames, (codec.name, codec.pix_fmt, stream.average_rate)
-
-
-def read_gif(path):
-    with Image.open(path) as gif:
-        frames, durations = [], []
-        for number in range(gif.n_frames):
-            gif.seek(number)
-            frames.append(np.asarray(gif.convert("RGB")))
-            durations.append(gif.info["duration"])
-        return frames, durations, gif.info["loop"]
-
-
 def same(frame, other, tolerance):
     return np.abs(frame.astype(float) - other).mean() < tolerance
 
 
 @needs_egl
 def test_an_mp4_from_the_command(tmp_path):
+    import av
+
     render(SAMPLE, "--out", tmp_path / "new" / "a.mp4")
-    frames, form = read_mp4(tmp_path / "new" / "a.mp4")
-    assert form == ("h264", "yuv420p", 25)
+    with av.open(str(tmp_path / "new" / "a.mp4")) as container:
+        (stream,) = container.streams.video
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+        codec = stream.codec_context  # a browser asks for these
+        assert (codec.name, codec.pix_fmt, stream.average_rate) == ("h264", "yuv420p", 25)
     assert [frame.shape for frame in frames] == [(64, 96, 3)] * 5
     assert not same(frames[0], frames[-1], 2)
     assert [path.name for path in tmp_path.rglob("*.*")] == ["a.mp4"]
@@ -81,8 +65,13 @@ def test_an_mp4_from_the_command(tmp_path):
 @needs_egl
 def test_a_gif_from_the_command_loops(tmp_path):
     render(SAMPLE, "--out", tmp_path / "a.gif", "--fps", 30)
-    frames, durations, loop = read_gif(tmp_path / "a.gif")
-    assert (len(frames), frames[0].shape, loop) == (6, (64, 96, 3), 0)
+    with Image.open(tmp_path / "a.gif") as gif:
+        frames, durations = [], []
+        for number in range(gif.n_frames):
+            gif.seek(number)
+            frames.append(np.asarray(gif.convert("RGB")))
+            durations.append(gif.info["duration"])
+        assert (len(frames), frames[0].shape, gif.info["loop"]) == (6, (64, 96, 3), 0)
     assert durations == [30, 40, 30, 30, 40, 30]  # as near to 1/30 s as a GIF counts
     assert not same(frames[0], frames[-1], 2)
 

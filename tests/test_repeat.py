@@ -77,16 +77,9 @@ def run(tmp_path_factory):
     """A run with actions that are held."""
     small = {"net_arch": [8], "learning_starts": 1000, "num_envs": 2, "train_freq": 1}
     folder = tmp_path_factory.mktemp("repeat") / "run"
-    what = Run.of(
-        TASK,
-        "sac",
-        "modern",
-        {**small, "action_repeat": REPEAT, "n_steps": 3},
-        steps=301,
-        evaluate_every=100,
-        evaluation_episodes=3,
-        final_episodes=3,
-    )
+    small |= {"action_repeat": REPEAT, "n_steps": 3}
+    played = {"evaluate_every": 100, "evaluation_episodes": 3, "final_episodes": 3}
+    what = Run.of(TASK, "sac", "modern", small, steps=301, **played)
     assert train(what, folder).steps == 304  # 38 steps of two robots, of four control steps each
     return folder
 

@@ -103,10 +103,8 @@ def test_every_preset_makes_an_agent_with_adam(algorithm, preset):
     ]
     assert optimizers
     assert {type(o) for o in optimizers} == {torch.optim.Adam}
-    assert agent.predict(agent.env.reset())[0].shape == (
-        ALGORITHMS[algorithm].presets[preset].num_envs,
-        1,
-    )
+    expected = (ALGORITHMS[algorithm].presets[preset].num_envs, 1)
+    assert agent.predict(agent.env.reset())[0].shape == expected
 
 
 def test_a_runs_folder(short):

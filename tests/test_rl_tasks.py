@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from behaviour import untrained
 from command import jbrep
-from small import ONE_EACH, assert_same_files
+from small import ONE_EACH, assert_same_files, stopping
 
 from jbrep.encoders import find
 from jbrep.envs import Environments, describe
@@ -19,24 +19,12 @@ from jbrep.records import container
 from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.agent import evaluate, make_agent, make_env, training_seed
 from jbrep.rl.controller import load_policy
-from jbrep.rl.files import (
-    CHECKPOINT,
-    EPISODES,
-    EVALUATIONS,
-    FAILED,
-    POLICY,
-    RUN,
-    read_evaluations,
-    read_run,
-)
+from jbrep.rl.files import CHECKPOINT, EPISODES, EVALUATIONS, POLICY, read_evaluations, read_run
 from jbrep.rl.policy import load_run
 from jbrep.rl.presets import ALGORITHMS, get_preset
 
 CART = describe(cart.ID)
-PENDULUM, HOPPER = describe("Pendulum-v1", episode_steps=50), describe("Hopper-v5")
-FAILING = CART.replace(arguments={"fail_seed": training_seed(0) + 3})
-
-
+HOPPER = describe("Hopper-v5")
 SHORTER = {"n_steps": 16, "train_freq": 16, "gradient_steps": 4}
 SMALL = {"net_arch": [8], "learning_starts": 50, "batch_size": 16}
 
@@ -90,18 +78,18 @@ def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(tmp_path):
     run = Run.of(HOPPER, "sac", preset="modern", overrides=SMALL, steps=320, **ONE_EACH)
     one, other = tmp_path / "one", tmp_path / "other"
     train(run, one)
-    steps = []
     with pytest.raises(StoppedError):
-        train(run, other, Session(lambda _, step: steps.append(step), stop=lambda: steps[-1] >= 64))
+        train(run, other, stopping(64))
     assert len(container.read(other / CHECKPOINT, "checkpoint")[0]["envs.actions"])
     train(run, other)
     assert_same_files(one, other, EPISODES, EVALUATIONS, POLICY)
 
 
 def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
-    run = Run.of(task=FAILING, algorithm="a2c", steps=800, preset="paper", **ONE_EACH)
+    failing = CART.replace(arguments={"fail_seed": training_seed(0) + 3})
+    run = Run.of(task=failing, algorithm="a2c", steps=800, preset="paper", **ONE_EACH)
     result = train(run, tmp_path)
-    assert result.status == FAILED
+    assert result.status == "failed"
     assert f"at step 7 of the episode with seed {training_seed(0) + 3}" in result.reason
     assert result.reason.startswith("after 48 steps: ")  # of 8 environments
     assert read_run(tmp_path) == result
@@ -125,7 +113,7 @@ def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
         with pytest.raises(InputError, match="can't be resumed: out of order"):
             train(run, tmp_path)
     assert (tmp_path / CHECKPOINT).read_bytes() == before
-    assert not (tmp_path / RUN).exists()
+    assert not (tmp_path / "run.json").exists()
 
 
 def test_what_was_learned_outlives_an_environment_that_fails(tmp_path, monkeypatch):
@@ -143,7 +131,7 @@ def test_what_was_learned_outlives_an_environment_that_fails(tmp_path, monkeypat
         patch.setattr(Environments, "step", failing)
         with pytest.raises(InputError, match=r"is loose; .* goes on from it"):
             train(run, tmp_path / "run", session)
-    assert not (tmp_path / "run" / RUN).exists()
+    assert not (tmp_path / "run" / "run.json").exists()
     assert load_run(tmp_path / "run").step > 0
     assert train(run, tmp_path / "run", session).policy_sha256 == whole.policy_sha256
 
@@ -190,7 +178,7 @@ def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(tmp_path, monkeypatch)
     settings += ("--evaluation-episodes", 2, "--final-episodes", 3, "--out")
     folder, whole = tmp_path / "grown", tmp_path / "whole"
     assert jbrep(*settings, folder, "--steps", 160).exit_code == 0
-    kept = (CHECKPOINT, EPISODES, EVALUATIONS, POLICY, "policy.zip", RUN)
+    kept = (CHECKPOINT, EPISODES, EVALUATIONS, POLICY, "policy.zip", "run.json")
     before = {name: (folder / name).read_bytes() for name in kept}
     count, step = iter(range(1 << 20)), Environments.step
 
@@ -198,9 +186,7 @@ def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(tmp_path, monkeypatch)
         return broken() if next(count) == 60 else step(envs, actions)
 
     with monkeypatch.context() as patch:
-        patch.setattr(
-            Environments, "step", failing
-        )  # once the episode of now has been played again
+        patch.setattr(Environments, "step", failing)  # once the episode of now was played again
         told = jbrep(*settings, folder, "--steps", 320)
     assert told.exit_code == 1
     assert re.search("the run failed: after [0-9]+ steps: out of order", told.stderr)

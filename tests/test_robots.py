@@ -54,9 +54,6 @@ def closed(tmp_path):
     return left == "oc" * (len(left) // 2)
 
 
-# a robot's own files
-
-
 def hopper(path, gear):
     """The words of a command for a hopper with its own model."""
     text = HOPPER.read_text()
@@ -104,9 +101,6 @@ def test_an_episode_is_played_again_before_a_data_set_grows(tmp_path, monkeypatc
     assert len(contents(tmp_path / "d")) == len(before)
 
 
-# what 32 bits hold
-
-
 def test_a_clock_that_32_bits_swallow_is_told_and_shifted(tmp_path):
     robot = arm(tmp_path, clock=1764000000.25)
     told = jbrep("collect", *robot, "--steps", 50, "--threads", 1, "--out", tmp_path / "d")
@@ -144,9 +138,6 @@ def test_two_instances_of_a_class_are_two_robots():
     few, many = (describe(Paid(pay), episode_steps=5) for pay in (1.0, 100.0))
     assert few.id != many.id
     assert [evaluate_policy("still", task=each, episodes=1)[0] for each in (few, many)] == [5, 500]
-
-
-# one robot, which fails
 
 
 def test_one_instance_describes_collects_and_evaluates(tmp_path):
@@ -229,9 +220,6 @@ def test_evaluations_and_training_go_on_after_failures(tmp_path):
     assert closed(tmp_path)
 
 
-# readings that are missing
-
-
 def test_missing_readings_are_held_or_end_an_episode_and_counted(tmp_path):
     robot = arm(tmp_path, gaps=[4, 5, 9])
     command = ("collect", *robot, "--steps", 30, "--threads", 1, "--out", tmp_path / "d")
@@ -257,9 +245,6 @@ def test_missing_readings_are_held_or_end_an_episode_and_counted(tmp_path):
     np.testing.assert_array_equal(cut.episodes["final_observation"][0], held["observation"][3])
     assert not list(find_problems(tmp_path / "cut"))
     assert jbrep("data", "verify", tmp_path / "cut", "--replay", 2).exit_code == 0
-
-
-# what environments give
 
 
 def test_a_reward_in_an_array_and_a_joint_that_can_t_move(tmp_path):

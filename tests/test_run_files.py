@@ -21,16 +21,7 @@ from jbrep.play.sources import find_player
 from jbrep.records import container
 from jbrep.records.record import to_plain
 from jbrep.rl import Run, Session, train
-from jbrep.rl.files import (
-    CHECKPOINT,
-    ENCODER,
-    EVALUATIONS,
-    POLICY,
-    POLICY_ZIP,
-    RUN,
-    read_evaluations,
-    read_run,
-)
+from jbrep.rl.files import CHECKPOINT, ENCODER, EVALUATIONS, POLICY, read_evaluations, read_run
 from jbrep.rl.history import Scalars
 from jbrep.rl.policy import load_run
 
@@ -71,21 +62,9 @@ def under_way(trained, tmp_path):
     return folder
 
 
-def forge_policy(folder, tensors, **changes):
-    """Give a run another policy, with the hashes that belong to it."""
-    path = folder / POLICY
-    _, header = container.read(path, "policy")
-    container.write(path, tensors, {**header, **changes})
-    change(folder, policy_sha256=hashlib.sha256(path.read_bytes()).hexdigest())
-
-
-def weights_of(folder):
-    return container.read(folder / POLICY, "policy")[0]
-
-
 def change(folder, **changes):
-    record = json.loads((folder / RUN).read_text())
-    forge(folder / RUN, {**record, **changes})
+    record = json.loads((folder / "run.json").read_text())
+    forge(folder / "run.json", {**record, **changes})
 
 
 @pytest.mark.parametrize(
@@ -98,17 +77,18 @@ def change(folder, **changes):
     ids=str,
 )
 def test_a_field_of_a_run_that_cant_be_is_named(path, value, run):
-    record = json.loads((run / RUN).read_text())
+    record = json.loads((run / "run.json").read_text())
     *parents, name = path
     functools.reduce(operator.getitem, parents, record)[name] = value
-    forge(run / RUN, record)
+    forge(run / "run.json", record)
     told = refused(read_run, run)
-    assert (RUN in told, name in told) == (True, True)
+    assert ("run.json" in told, name in told) == (True, True)
 
 
 def test_weights_are_those_of_the_run(run):
-    path, weights = run / POLICY, weights_of(run)
-    container.write(path, weights | {"more": np.ones(1)}, container.read(path, "policy")[1])
+    path = run / POLICY
+    weights, header = container.read(path, "policy")
+    container.write(path, weights | {"more": np.ones(1)}, header)
     assert "its SHA-256 isn't in run.json" in refused(load_run, run)
     change(run, policy_sha256=None)
     assert "no policy" in refused(load_run, run)
@@ -125,22 +105,22 @@ def without(tensors, name):
     return {key: value for key, value in tensors.items() if key != name}
 
 
-LOG_STD = "policy.log_std"
-
-
 @pytest.mark.parametrize(
     "make",
     [
         lambda tensors: without(tensors, "policy.action_net.bias"),
         lambda tensors: {**tensors, "policy.more": np.ones(1, np.float32)},
-        lambda tensors: {**tensors, LOG_STD: np.ones(3, np.float32)},
-        lambda tensors: {**tensors, LOG_STD: np.full(1, np.nan, np.float32)},
+        lambda tensors: {**tensors, "policy.log_std": np.ones(3, np.float32)},
+        lambda tensors: {**tensors, "policy.log_std": np.full(1, np.nan, np.float32)},
     ],
     ids=range(4),
 )
 def test_a_policy_that_isn_t_the_run_s(make, run):
     """Its hashes are right: a stranger can work them out."""
-    forge_policy(run, make(weights_of(run)))
+    path = run / POLICY
+    tensors, header = container.read(path, "policy")
+    container.write(path, make(tensors), header)
+    change(run, policy_sha256=hashlib.sha256(path.read_bytes()).hexdigest())
     assert POLICY in refused(load_run, run)
 
 
@@ -156,18 +136,12 @@ def test_a_run_under_way_plays_its_checkpoint(under_way, trained):
     assert find_player(str(under_way)).step == 40
 
 
-def spoilt(header):
-    for name in ("settings", "episodes"):
-        yield {**header, name: "x"}
-    yield {**header, "settings": {**header["settings"], "seed": 10**30}}
-    yield {**header, "step": -1}
-
-
 def test_a_damaged_checkpoint_is_named(under_way):
     path = under_way / CHECKPOINT
     tensors, header = container.read(path, "checkpoint")
-    for changed in spoilt(header):
-        container.write(path, tensors, changed)
+    seed = {"settings": {**header["settings"], "seed": 10**30}}
+    for changes in ({"settings": "x"}, {"episodes": "x"}, seed, {"step": -1}):
+        container.write(path, tensors, {**header, **changes})
         assert CHECKPOINT in refused(load_run, under_way)
     container.write(path, without(tensors, "parameters.policy.log_std"), header)
     assert "doesn't fit the run's settings" in refused(load_run, under_way)
@@ -178,7 +152,7 @@ def test_a_damaged_checkpoint_is_named(under_way):
 
 def test_evaluating_a_run(run):
     by_folder = jbrep("evaluate-policy", run, "--episodes", 2).output
-    for name in (POLICY, POLICY_ZIP):
+    for name in (POLICY, "policy.zip"):
         assert jbrep("evaluate-policy", run / name, "--episodes", 2).output == by_folder
     record = json.loads(jbrep("evaluate-policy", run, "--episodes", 2, "--json").output)
     assert (record["task"], record["representation"]) == (TASK.name, "dae-8")
@@ -189,7 +163,7 @@ def test_evaluating_a_run(run):
 def test_another_encoder_is_not_the_run_s(run):
     save(find("pca-8", TASK), run / ENCODER)
     assert "is not the encoder that the run in" in refused(load_run, run)
-    settings = json.loads((run / RUN).read_text())["settings"]
+    settings = json.loads((run / "run.json").read_text())["settings"]
     own = find("pca-8", TASK).fingerprint
     pose = {"task": "move_to_pose", "environment": to_plain(describe("move_to_pose"))}
     change(run, settings={**settings, "encoder": own, **pose})

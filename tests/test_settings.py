@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from behaviour import untrained
-from small import assert_same_files
+from small import assert_same_files, stopping
 
 from jbrep.encoders import find
 from jbrep.envs import describe
@@ -15,7 +15,7 @@ from jbrep.envs.environments import Environments
 from jbrep.envs.recording import outcome
 from jbrep.errors import InputError
 from jbrep.records.document import toml_text
-from jbrep.rl import Run, Session, StoppedError, train
+from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import evaluate, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, read_evaluations
 from jbrep.rl.learner import Learner, read_preset
@@ -29,13 +29,8 @@ TASK = describe("Pendulum-v1", episode_steps=20)
 PINK = {"kind": "coloured", "beta": 1, "sigma": 0.2}
 HELD = {"action_repeat": 3, "n_steps": 2}
 SMALL = {"net_arch": [8], "learning_starts": 10, "train_freq": 5, "batch_size": 8}
-QUICK = {
-    "task": TASK,
-    "preset": "modern",
-    "steps": 60,
-    "evaluation_episodes": 2,
-    "final_episodes": 2,
-}
+QUICK = {"task": TASK, "preset": "modern", "steps": 60}
+QUICK |= {"evaluation_episodes": 2, "final_episodes": 2}
 SAC_RUN = Run.of(**QUICK, overrides={**SMALL, "normalize": True})
 
 
@@ -141,15 +136,10 @@ def test_a_table_that_is_no_learner(name, table, named):
         Learner.of_table(name, table)
 
 
-def resumed(run, folder, stop_at=30):
+def resumed(run, folder):
     """The run in a folder, stopped once on the way."""
-    steps = [0]
     with pytest.raises(StoppedError):
-        train(
-            run,
-            folder,
-            Session(lambda _, step: steps.append(step), stop=lambda: steps[-1] >= stop_at),
-        )
+        train(run, folder, stopping(30))
     assert load_run(folder).step
     train(run, folder)
     return folder

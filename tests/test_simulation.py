@@ -8,15 +8,13 @@ from jbrep.jitterbug.bodies import draw
 from jbrep.jitterbug.simulation import PHYSICS_STEPS, Simulation, plain_model
 from jbrep.jitterbug.tasks import get_task
 
-STEPS = 150
 
-
-def rollout(seeds, num_threads, task="move_to_pose", spoil=None):
+def rollout(seeds, num_threads, spoil=None):
     """Observations, rewards and divergence of each seed's environment, (T, n, ...)."""
-    simulation = Simulation(get_task(task), len(seeds), num_threads)
+    simulation = Simulation(get_task("move_to_pose"), len(seeds), num_threads)
     simulation.reset(range(len(seeds)), [np.random.default_rng(seed) for seed in seeds])
     actions = np.stack(
-        [np.random.default_rng([seed, 1]).uniform(-1, 1, (STEPS, 1)) for seed in seeds], 1
+        [np.random.default_rng([seed, 1]).uniform(-1, 1, (150, 1)) for seed in seeds], 1
     )
     tape = []
     for step, action in enumerate(actions):
@@ -27,18 +25,14 @@ def rollout(seeds, num_threads, task="move_to_pose", spoil=None):
     return tuple(np.array(column) for column in zip(*tape, strict=True))
 
 
-def assert_same(one, other, envs=slice(None), of=slice(None)):
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(a[:, envs], b[:, of])
-
-
 @pytest.mark.parametrize("value", [np.nan, 1e12])
 def test_a_environment_that_diverges_says_so_and_leaves_the_others_alone(value):
     def spoil(simulation):
         simulation.readings.qvel[1, 4] = value
 
     whole, spoilt = rollout(range(3), 2), rollout(range(3), 2, spoil=spoil)
-    assert_same(whole, spoilt, [0, 2], [0, 2])
+    for one, other in zip(whole, spoilt, strict=True):
+        np.testing.assert_array_equal(one[:, [0, 2]], other[:, [0, 2]])
     assert not whole[2].any()
     assert not spoilt[2][:100].any()
     assert spoilt[2][100, 1]

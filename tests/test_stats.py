@@ -44,19 +44,10 @@ def make(representation="full", seed=0, level=500.0, **changes):
     steps = changes.pop("steps", GRID)
     noise = np.random.default_rng([seed or 0, len(representation)]).normal(0, 3, (len(steps), 3))
     rise = level * (1 - np.exp(-np.asarray(steps) / 2000))
-    facts = {
-        "task": "face_direction",
-        "algorithm": "sac",
-        "representation": representation,
-        "seed": seed,
-        "settings": "a1",
-        "steps": steps,
-        "returns": np.clip(rise[:, None] + noise, 0, 1000),
-        "total_steps": 10_000,
-        "return_floor": 0.0,
-        "reference": 0.0,
-        "solved": 900.0,
-    }
+    facts = {"task": "face_direction", "algorithm": "sac", "representation": representation}
+    facts |= {"seed": seed, "settings": "a1", "steps": steps, "total_steps": 10_000}
+    facts |= {"returns": np.clip(rise[:, None] + noise, 0, 1000)}
+    facts |= {"return_floor": 0.0, "reference": 0.0, "solved": 900.0}
     return RunCurve(**{**facts, **changes})
 
 
@@ -115,9 +106,6 @@ def shapes(n, random, studies=3000):
     yield 500 + 30 * random.standard_t(5, (studies, n)) / np.sqrt(5 / 3)
 
 
-# runs
-
-
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
@@ -156,9 +144,6 @@ UNSEEN = {"steps": NONE, "returns": np.ones((0, 1)), "failed_at": 0, "return_flo
 def test_studies_that_would_mislead(runs, named):
     with pytest.raises(InputError, match=named):
         analyse(runs)
-
-
-# curves
 
 
 def test_runs_with_other_grids_are_compared_where_all_have_evaluations():
@@ -252,9 +237,6 @@ def test_expected_shortfall_is_the_integral_of_the_quantiles():
     assert expected_shortfall(normal, 0.05) == pytest.approx(expected, abs=1e-3)
 
 
-# intervals
-
-
 def test_bonett_by_hand():
     """Kurtosis about the median for five runs: sums of squares 10 and 40, of fourths 34, 544."""
     x = np.arange(1.0, 6)
@@ -321,9 +303,6 @@ def test_groups_without_variance_have_no_interval():
     for pair in ((still, still), (still, other), (other, still)):
         assert variance_ratio(*pair).tolist()[1:] == [None, None]
     assert variance_ratio(other[:2], other[:2]).tolist()[1:] == [None, None]
-
-
-# the whole
 
 
 def test_an_analysis_does_not_depend_on_the_order_of_runs(runs, analysis):

@@ -38,14 +38,8 @@ from jbrep.studies.tables import write_tables
 
 TASK = "face_direction"
 NET = "my_encoders:Net"
-SHARED = {
-    "task": describe(TASK, {}, 50),
-    "algorithm": "a2c",
-    "preset": "paper",
-    "steps": 80,
-    "evaluate_every": 80,
-    **ONE_EACH,
-}
+SHARED = {"task": describe(TASK, {}, 50), "algorithm": "a2c", "preset": "paper", **ONE_EACH}
+SHARED |= {"steps": 80, "evaluate_every": 80}
 TINY = TINY_STUDY.replace(representations=("full",), episode_steps=50)
 
 
@@ -328,15 +322,8 @@ def test_a_mistaken_representation_is_refused(given, field):
 def test_a_run_on_code(done, tmp_path, monkeypatch):
     out = tmp_path / "run"
     options = ("--task", TASK, "--episode-steps", 50, "--algorithm", "a2c", "--steps", 80)
-    options += (
-        "--evaluate-every",
-        80,
-        "--final-episodes",
-        1,
-        "--evaluation-episodes",
-        1,
-        "--encoder",
-    )
+    options += ("--evaluate-every", 80, "--final-episodes", 1, "--evaluation-episodes", 1)
+    options += ("--encoder",)
     told = jbrep("rl", *options, NET, "--out", out)
     assert told.exit_code == 0, told.output
     assert f"encoder: {NET}, code" in told.stdout

@@ -47,11 +47,8 @@ def runs(tmp_path_factory):
     usual = {"preset": "paper", "evaluate_every": 80, **ONE_EACH}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(container, "write", keep)
-        train(
-            Run.of(task=SHORT, algorithm="a2c", encoder="dae-8", steps=80, **usual),
-            folder / "jb",
-            Session(save_every=0),
-        )
+        run = Run.of(task=SHORT, algorithm="a2c", encoder="dae-8", steps=80, **usual)
+        train(run, folder / "jb", Session(save_every=0))
     train(Run.of(SLEDGE, "sac", steps=20, overrides=NORMALIZE, **usual), folder / "sledge")
     return folder
 

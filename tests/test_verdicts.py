@@ -122,9 +122,6 @@ def test_a_reader_gets_the_numbers_with_numpy_alone(reports, monkeypatch, capsys
         assert printed[label.representation].split(", ")[: len(expected)] == expected
 
 
-# before a study
-
-
 @pytest.mark.parametrize(
     ("changes", "field"),
     [

@@ -57,6 +57,6 @@ def run(plan):
 
 if __name__ == "__main__":
     sys.path.append(str(Path(__file__).parent.parent))
-    from test_cluster import STUDY
+    from test_pool import STUDY
 
     run(Plan(STUDY, Path(sys.argv[1]) / "study"))

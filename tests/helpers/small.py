@@ -8,6 +8,7 @@ from jbrep.collecting.derive import _each_shard
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import read_manifest
 from jbrep.envs import describe
+from jbrep.rl import Session
 
 ONE_EACH = {"evaluation_episodes": 1, "final_episodes": 1}  # of a run, in each of its evaluations
 
@@ -47,6 +48,12 @@ def flip_bit(path, bit):
     content = bytearray(path.read_bytes())
     content[bit // 8] ^= 1 << bit % 8
     path.write_bytes(content)
+
+
+def stopping(step):
+    """A session of training that ends after so many steps."""
+    steps = [0]
+    return Session(lambda _, now: steps.append(now), stop=lambda: steps[-1] >= step)
 
 
 def forge(path, record):
