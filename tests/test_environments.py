@@ -1,5 +1,6 @@
 """Environments over any environment: resets, ends, snapshots, and environments that fail."""
 
+import environments  # noqa: F401 - it registers the sledges
 import gymnasium
 import numpy as np
 import pytest
