@@ -214,10 +214,8 @@ class UserPolicy:
         Of a model its network is played, so it must see and do what the task says, unscaled.
         """
         if hasattr(policy, "get_vec_normalize_env"):
-            from jbrep.encoders.vec_env import JitterbugVecEnv
-
-            bare = getattr(policy.get_env(), "unwrapped", None)
-            is_ours = isinstance(bare, JitterbugVecEnv) or hasattr(policy, "action_repeat")
+            env = getattr(policy.get_env(), "unwrapped", None)
+            is_ours = getattr(env, "scales", False) or hasattr(policy, "action_repeat")
             if is_ours or policy.get_vec_normalize_env():
                 raise InputError(
                     "the model learned on scaled observations or actions: give a run's folder, or "

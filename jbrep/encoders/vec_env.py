@@ -66,6 +66,7 @@ class JitterbugVecEnv(VecEnv):
     """
 
     render_mode = None
+    scales = True  # observations and actions: a network without it acts otherwise
 
     def __init__(
         self,
