@@ -271,6 +271,14 @@ def test_a_unit_that_says_nothing_stays_so(data, rows, codes):
     assert np.isfinite(run(decoder, code)).all()
 
 
+def test_units_that_depend_on_others_are_whitened_but_for_rounding(data, rows):
+    weight = 100 * np.random.default_rng(0).normal(size=(3, data.size))
+    weight[2] = weight[0] + weight[1]
+    encoder, *_ = complete(Made((dense(weight, np.zeros(3)),)), data, "white")
+    spread = np.linalg.eigvalsh(np.cov(run(encoder, rows).astype(float).T))
+    np.testing.assert_allclose(spread, [0, 1 / 9, 1 / 9], atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("kind", "on"), [("pca", "observation"), ("slow", "angles"), ("dae", "observation")]
 )

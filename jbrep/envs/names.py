@@ -244,7 +244,7 @@ def absolute(arguments: Mapping[str, Any]) -> dict[str, Any]:
 def files_of(arguments: Mapping[str, Any]) -> dict[str, str]:
     """SHA-256 of the files that arguments name, such as a model, by the arguments' names."""
     paths = {name: _path(value) for name, value in arguments.items()}
-    return {name: _digest(path) for name, path in paths.items() if path and path.is_file()}
+    return {name: file_digest(path) for name, path in paths.items() if path and path.is_file()}
 
 
 def code_of(maker: Any) -> dict[str, str]:
@@ -280,7 +280,7 @@ def _module_code(name: str) -> dict[str, str]:
     path = Path(file).resolve() if file and name != "__main__" else None
     if path is None or not path.is_file() or any(each in path.parents for each in _INSTALLED):
         return {}
-    return {f"module {name}": _digest(path)}
+    return {f"module {name}": file_digest(path)}
 
 
 def _path(value: Any) -> Path | None:
@@ -295,5 +295,6 @@ def _path(value: Any) -> Path | None:
     return None
 
 
-def _digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file."""
     return hashlib.sha256(read_file(path)).hexdigest()

@@ -20,7 +20,7 @@ from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader, check_name
 from jbrep.encoders.layers import dense, run
 from jbrep.envs.task import Array
 from jbrep.errors import InputError, differences
-from jbrep.methods.linear import DEVIATION, held_out_error
+from jbrep.methods.linear import DEVIATION, NEGLIGIBLE, held_out_error
 from jbrep.methods.registry import get_method, name_of
 from jbrep.records.commit import commits
 from jbrep.records.record import to_plain
@@ -30,7 +30,7 @@ from jbrep.training.objective import Layers
 from jbrep.training.trainer import Trainer, default_batch_size, get_device, single_thread
 from jbrep.training.windows import Windows, count_windows, watched_windows
 
-_NEGLIGIBLE = 1e-12  # variance of a unit that says nothing
+_NOTHING = 1e-12  # variance of a unit that says nothing
 
 
 class Fitted(NamedTuple):
@@ -274,10 +274,11 @@ def _rescaled(
 ) -> tuple[Layers, Layers]:
     """The same code with standard deviation 1/3 in each unit, uncorrelated if it is to be white."""
     mean, covariance = moments
-    axes, variance = np.eye(len(mean)), np.diag(covariance)
-    if codes == "white":
+    axes, variance, least = np.eye(len(mean)), np.diag(covariance), _NOTHING
+    if codes == "white":  # units may depend on others, but for rounding
         variance, axes = np.linalg.eigh(covariance)
-    varies = variance > _NEGLIGIBLE
+        least = NEGLIGIBLE * variance[-1]
+    varies = variance > least
     scale = axes * np.where(varies, DEVIATION / np.sqrt(np.where(varies, variance, 1)), 1) @ axes.T
     return _after(encoder, scale, -scale @ mean), _before(decoder, np.linalg.inv(scale), mean)
 

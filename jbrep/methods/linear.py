@@ -20,7 +20,7 @@ from jbrep.training.objective import Layers
 
 DEVIATION = 1 / 3  # of a unit of a scaled code, so that most of its values lie in [-1, 1]
 NOTHING = 1e-10  # mean squared error of features scaled to [-1, 1]: rounding
-_NEGLIGIBLE = 1e-9  # variance, as a share of the largest
+NEGLIGIBLE = 1e-9  # variance, as a share of the largest
 _TINY = 1e-300  # variance of what is constant, to divide by
 _NAMED = 0.1  # part in a linear dependence from which a feature is named, beside the largest
 
@@ -71,7 +71,7 @@ def whitening(
     """
     deviation = np.sqrt(np.maximum(np.diag(covariance) if total is None else total, _TINY))
     variances, vectors = np.linalg.eigh(covariance / np.outer(deviation, deviation))
-    if not variances[0] > _NEGLIGIBLE * variances[-1]:
+    if not variances[0] > NEGLIGIBLE * variances[-1]:
         share = np.abs(vectors[:, 0])
         named = [data.names[i] for i in np.flatnonzero(share > _NAMED * share.max())]
         raise InputError(

@@ -37,7 +37,8 @@ def write_whole(path: Path, content: bytes, ready: Callable[[], object] = lambda
             file.write(content)
         sync(partial)
         ready()
-        publish(partial, path)
+        partial.replace(path)
+        sync(path.parent)
     except OSError as error:
         reason = f"{error.strerror or error} ({len(content):,} bytes are needed)"
         raise InputError(f"can't write {path}: {reason}") from error

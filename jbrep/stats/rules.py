@@ -115,6 +115,11 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
         """What scores 1: the policy or the return that is named, or else the scripted one."""
         return LOOKING if self.reference == "" else self.reference
 
+    @property
+    def policy(self) -> str:
+        """The policy that is named to score 1; empty for a return, and for the scripted one."""
+        return self.reference if isinstance(self.reference, str) else ""
+
     def baseline_of(self, names: Iterable[str]) -> str:
         """The representation that others are compared with, of some in the order of tables."""
         every = [*names]

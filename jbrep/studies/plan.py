@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
-from jbrep.envs.names import environment_versions
+from jbrep.envs.names import environment_versions, file_digest
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.play.sources import frozen_file
 from jbrep.records.commit import CHANGES, commits, in_work_tree, is_committed
@@ -288,8 +288,9 @@ class Plan:
     @property
     def reference(self) -> dict[str, str]:
         """SHA-256 of the file of the policy that scores 1, by its path, if it is in a file."""
-        path = frozen_file(str(self.study.verdicts.reference))
-        return {str(path): hashlib.sha256(read_file(path)).hexdigest()} if path else {}
+        named = self.study.verdicts.policy
+        path = frozen_file(named) if named else None
+        return {str(path): file_digest(path)} if path else {}
 
     @property
     def policies(self) -> dict[str, str]:

@@ -102,8 +102,8 @@ def _check_own(plan: Plan) -> None:
 
 def _check_reference(plan: Plan) -> None:
     """Check that the policy that scores 1 can play one of the tasks; others have no score then."""
-    problem, named = None, plan.study.verdicts.reference
-    for task in map(plan.study.task, plan.study.tasks if isinstance(named, str) and named else ()):
+    problem, named = None, plan.study.verdicts.policy
+    for task in map(plan.study.task, plan.study.tasks if named else ()):
         try:
             find_player(named, task).begin(task, [0])
             return

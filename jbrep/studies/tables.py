@@ -29,8 +29,8 @@ from jbrep.text import counted
 
 RETURNS = "returns.csv"
 REFERENCE_RETURNS = "references.csv"
-_MOST_SECONDS = 600.0
 RUN_INFOS = "run-infos.csv"  # a run may be in the same folder: its own table is infos.csv
+_MOST_SECONDS = 600.0  # to wait for another process's tables
 
 References = dict[str, dict[str, list[float]]]  # returns by task and policy
 
@@ -225,8 +225,8 @@ def play_references(folder: Path) -> None:
         there = _references(folder, record.tables)
     except DamageError as error:
         there, damage = {}, error
-    top = record.study.verdicts.reference if record.study else ""
-    further, episodes = [top] if isinstance(top, str) and top else [], dict[str, int]()
+    named = record.study.verdicts.policy if record.study else ""
+    further, episodes = [named] if named else [], dict[str, int]()
     for label in record.labels.values():
         own = label.settings
         episodes[own.task] = max(episodes.get(own.task, 0), own.final_episodes)
