@@ -223,8 +223,7 @@ def collect(
     for part in parts_of(settings.policy):
         kept = folder / part.get("file", "")
         if part["kind"] == TRAINED and exists(kept) and kept.read_bytes() == files[kept.name]:
-            acts = f"{part['run']} acts as it did at step {part['step']:,}"
-            _note(f"{acts}, which {kept} keeps")
+            _note(f"{kept} keeps the policy of {part['run']} at step {part['step']:,}")
     run(settings, folder, num_envs, threads, actor, retries)
     return Dataset(folder)
 
@@ -420,7 +419,7 @@ def train(
     folder, found = Path(out), run.find_encoder()
     now = standing_of(run, folder, found)
     if now.ended:
-        _note(f"the run in {folder} had {now.ended.status} already: nothing was done")
+        _note(f"the run in {folder} has already {now.ended.status}: nothing to do")
     else:
         _note_limits(now.settings)
     with closing(Bar(run.steps, f"{algorithm} on {found.name}")) as bar:
@@ -546,16 +545,14 @@ def report(
             tables; {task} stands for each task. May be repeated.
         out: a folder for the report; by default the study's own.
     """
-    from jbrep.records.storage import exists, make_folder
+    from jbrep.records.storage import exists
 
     evaluation = [evaluation] if isinstance(evaluation, str | Path) else evaluation
     if not exists(folder):
         raise InputError(f"{folder} is not the folder of a study: there is no such folder")
-    if out:
-        make_folder(Path(out))
     from jbrep.reporting.report import make_report  # imports torch
 
-    return make_report(Path(folder), Path(out) if out else None, evaluation)
+    return make_report(Path(folder), Path(out) if out else None, [*map(str, evaluation)])
 
 
 def _fitter(data: "Dataset | str | Path", out: str | Path, device: str) -> "Fitter":

@@ -34,8 +34,8 @@ Retries = Annotated[
     Meta(
         ge=0,
         le=1_000_000,
-        description="Times in a row that a failing environment is recreated, except when it is "
-        "first tried.",
+        description="How often in a row a failing environment is made again; its first start "
+        "isn't retried.",
     ),
 ]
 Episodes = Annotated[

@@ -168,7 +168,7 @@ def test_a_data_set_of_what_is_not_reproducible_says_so(tmp_path):
     told = jbrep(*command)
     assert f"{env_id} is not reproducible: no episode can be simulated again" in told.stderr
     for _ in range(3):  # although a pilot run may end otherwise each time
-        assert "it was complete already" in jbrep(*command).stdout
+        assert "already complete" in jbrep(*command).stdout
     assert jbrep("data", "verify", data).exit_code == 0
     told = jbrep("data", "verify", data, "--replay", 1)
     assert (told.exit_code, told.output.count("\n")) == (2, 1)

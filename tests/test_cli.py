@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from importlib.metadata import packages_distributions, version
 from itertools import chain
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 from click.shell_completion import ShellComplete
 from click.testing import CliRunner
-from command import jbrep
+from command import jbrep, mistake
 from msgspec import Meta, field
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -38,6 +39,13 @@ GROUPS = ("data", "encoder", "policy")
 COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
     f"{group} {name}" for group in GROUPS for name in sorted(main.commands[group].commands)
 ]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_what_a_command_needs_is_asked_for(command):
+    known = reduce(lambda group, name: group.commands[name], command.split(), main)
+    if any(each.required for each in known.params):
+        assert "Missing" in mistake(*command.split())
 
 
 def test_a_run_from_training_to_its_returns(tmp_path):
@@ -181,7 +189,7 @@ def test_a_data_set_from_collecting_to_exporting(tmp_path):
     assert re.search(r"2 episodes of face_direction, 1,200 rows, 0\.\d MB in", told)
     assert re.search(r"1,200 rows in \d+ s, [\d,]+ a second", told)
     told = jbrep(*arguments)
-    assert (told.exit_code, "complete already: nothing was done" in told.output) == (0, True)
+    assert (told.exit_code, "already complete: nothing to do" in told.output) == (0, True)
     assert re.search(r"episodes +2 of 600 steps\n", jbrep("data", "info", data).output)
     told = jbrep("data", "verify", data, "--replay", 2)
     assert "no problems in 1,200 rows, 2 shards" in told.output

@@ -1,5 +1,7 @@
 """The denoising autoencoder: gradient, corruption, training, checkpoints."""
 
+from itertools import chain
+
 import numpy as np
 import pytest
 import torch
@@ -65,7 +67,7 @@ def test_layers_give_what_the_network_gives(architecture):
 
 def drawn(it, epoch):
     """All corrupted and clean rows of an epoch, in its order."""
-    batches = list(it._batches(epoch))
+    batches = list(chain.from_iterable(it._draws(epoch)))
     assert [clean.shape[1] for _, clean in batches] == [100] * 20
     return (torch.cat(part, 1).T for part in zip(*batches, strict=True))
 

@@ -14,8 +14,7 @@ from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.encoders.header import EncoderHeader
 from jbrep.encoders.shipped import unlearned
 from jbrep.errors import InputError
-from jbrep.evaluation import diagnose
-from jbrep.evaluation.diagnosis import seen, write
+from jbrep.evaluation.diagnosis import diagnose, seen, write
 from jbrep.evaluation.evaluation import EVALUATION, Evaluation
 from jbrep.evaluation.held_out import MAX_NUMBERS, HeldOut, sample_rows
 from jbrep.evaluation.readout import every, latent_units

@@ -8,7 +8,7 @@ import jbrep
 from jbrep.collecting.derive import derive
 from jbrep.encoders import find
 from jbrep.envs.names import import_modules
-from jbrep.evaluation import diagnose
+from jbrep.evaluation.diagnosis import diagnose
 from jbrep.studies.config import read_study
 from jbrep.studies.plan import Plan
 from jbrep.studies.prepare import check

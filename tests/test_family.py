@@ -36,7 +36,7 @@ def test_relatives_learn_to_reconstruct(kind, data, tmp_path):
     settings = {"latent": 8, "epochs": epochs, "learning_rate": rate, "batch_size": 100}
     encoder, path, *_ = Fitter(data, tmp_path).fit(kind, **settings)
     assert path.name == f"{kind}-8.safetensors"
-    assert read_name(f"{kind}-8").method is METHODS[kind]
+    assert read_name(f"{kind}-8")[0] is METHODS[kind]
     rows = data.dataset["observation"][data.train]
     assert encoder(rows).shape == (4000, 8)
     rows, back = data.scale(rows), data.scale(encoder.decode(encoder(rows)))

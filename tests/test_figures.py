@@ -11,7 +11,8 @@ from PIL import Image
 
 from jbrep.reporting.figures import study_plots, write
 from jbrep.reporting.figures.panels import COLUMN, PAGE, PAPER
-from jbrep.stats import RunCurve, analyse
+from jbrep.stats.analysis import analyse
+from jbrep.stats.runs import RunCurve
 
 STEPS = np.arange(0, 50_001, 10_000)
 FINAL = {"full": 900, "dae-8": 500, "pca-4": 300}

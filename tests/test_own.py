@@ -22,7 +22,7 @@ from jbrep.encoders import find
 from jbrep.encoders.base import as_encoder
 from jbrep.envs import describe
 from jbrep.envs.names import import_code
-from jbrep.evaluation import diagnose
+from jbrep.evaluation.diagnosis import diagnose
 from jbrep.jitterbug import JitterbugEnv
 from jbrep.rl import Run, train
 from jbrep.rl.files import ENCODER

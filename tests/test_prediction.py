@@ -14,9 +14,9 @@ from jbrep.encoders import Encoder, Layer
 from jbrep.encoders.header import EncoderHeader
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.evaluation import control, diagnose, prediction, regression
+from jbrep.evaluation import control, prediction, regression
 from jbrep.evaluation.control import GoodPolicy, PlayedEpisode, lost, needs
-from jbrep.evaluation.diagnosis import networks
+from jbrep.evaluation.diagnosis import diagnose, networks
 from jbrep.evaluation.evaluation import Judged, Lost, Score
 from jbrep.evaluation.held_out import HeldOut, explained
 from jbrep.evaluation.readout import probes

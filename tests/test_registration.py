@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from command import in_this_process, jbrep
@@ -23,6 +24,7 @@ from jbrep.records.document import read_document
 from jbrep.rl.files import RUN, read_run, runs_below
 from jbrep.rl.policy_file import shipped_file
 from jbrep.stats.rules import Rules
+from jbrep.studies import runner
 from jbrep.studies.config import Data, read_study
 from jbrep.studies.plan import REGISTRATION, Plan, find_committed, registration_in, seal
 from jbrep.studies.prepare import check, prepare
@@ -194,7 +196,7 @@ def test_claims_in_a_work_tree_run_once_they_are_committed(repository, tmp_path,
     assert jbrep("study", path, "--out", out, "--register").exit_code == 2  # there are runs
     registration.replace(date="2000-01-01T00:00:00+00:00").write(beside)
     commit(repository)
-    with pytest.raises(InputError, match="registered otherwise"):
+    with pytest.raises(InputError, match="with another registration"):
         run_study(Plan(CLAIMS, out, path), in_this_process, 1)
 
 
@@ -294,8 +296,13 @@ def test_the_committed_results_are_of_the_studies_that_were_registered(path):
     assert record.study.replace(title="", evaluations=()) == study.replace(title="", evaluations=())
 
 
-def test_a_study_with_claims_is_registered_when_it_begins(tmp_path):
+def test_a_study_with_claims_is_registered_when_it_begins(tmp_path, monkeypatch):
     """Without a registration before the first run, there are no verdicts."""
+    stopped = Mock(side_effect=[KeyboardInterrupt, None])
+    monkeypatch.setattr(runner, "prepare", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_study(Plan(CLAIMS, tmp_path / "study"), first_run, 1)
+    monkeypatch.setattr(Plan, "to_register", Mock(side_effect=AssertionError))
     assert run_study(Plan(CLAIMS, tmp_path / "study"), first_run, 1) == 0
     again = Plan(CLAIMS, tmp_path / "study")
     assert "its registration is in no commit" in again.deviations([])

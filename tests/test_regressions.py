@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+import warnings
 from types import SimpleNamespace
 
 import gymnasium
@@ -18,6 +19,7 @@ from small import write_again
 from stable_baselines3 import A2C
 
 from jbrep import JitterbugVecEnv, api
+from jbrep.checking.check import _by_turning
 from jbrep.collecting import collect
 from jbrep.collecting.backends import _can_be_sent
 from jbrep.collecting.policies import Heuristic, UserPolicy
@@ -29,10 +31,12 @@ from jbrep.envs import Feature, Task, describe
 from jbrep.envs.autoreset import AutoresetEnvironments
 from jbrep.envs.description import with_features
 from jbrep.envs.environments import Environments, Retries
+from jbrep.envs.names import name_given
 from jbrep.errors import STEP_TIMEOUT, InputError, Notice
 from jbrep.evaluation.diagnosis import seen
 from jbrep.evaluation.evaluation import Score, measured
 from jbrep.inspection.scene import as_qpos
+from jbrep.jitterbug.gym import JitterbugEnv
 from jbrep.methods.fit import Fitter
 from jbrep.play.references import policies_of
 from jbrep.progress import _Log
@@ -159,7 +163,7 @@ def test_a_warm_up_is_of_whatever_learns_off_policy():
 
 
 def test_statistics_are_of_what_a_policy_sees():
-    good = Statistics.untrained(2).tensors
+    good = Statistics(np.zeros(2), np.ones(2), 1e-4).tensors
     assert Statistics.read(good, 2).mean.shape == (2,)
     mean = "statistics.mean"
     for bad in ({}, {**good, mean: np.zeros(1)}, {**good, mean: np.array([0, np.nan])}):
@@ -408,7 +412,12 @@ def test_who_shares_a_generator_with_others_is_not_reproducible():
 
 
 @pytest.mark.parametrize(
-    "odd", [{"env": {"how": b"x"}}, {"action_bounds": ((-1, 1), (3,))}, {"hide": "none"}]
+    "odd",
+    [
+        {"env": {"how": b"x"}},
+        *({"action_bounds": bounds} for bounds in (((-1, 1), (3,)), 1.0)),
+        {"hide": "none"},
+    ],
 )
 def test_odd_descriptions_are_refused(odd):
     with pytest.raises(InputError, match=r"env|action_bounds|'none'"):
@@ -510,3 +519,51 @@ def test_nobody_who_reads_and_no_working_folder(tmp_path, monkeypatch, brief):
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
     assert jbrep("data", "info", brief).exit_code == 0
+
+
+def test_numbers_of_numpy_are_numbers():
+    few = describe(
+        "Regressions/Rail-v0", action_bounds=[*zip(-np.ones(1), np.ones(1), strict=True)]
+    )
+    assert few == describe("Regressions/Rail-v0", action_bounds=np.array([[-1, 1]]))
+    ends = {"action_low": tuple(-np.ones(1)), "action_high": np.ones(1), "max_episode_steps": 9}
+    assert Task(id="A-v0", name="A-v0", features=(Feature("x"),), **ends).action_high == (1.0,)
+    named = describe(gymnasium.make("Regressions/Rail-v0", scale=np.float64(2)))
+    assert named.arguments == {"scale": 2.0}
+
+
+class Left:
+    class Robot(Rail):
+        pass
+
+
+class Right:
+    class Robot(Rail):
+        pass
+
+
+def test_nested_classes_of_one_name_are_several():
+    names = [describe(each.Robot, episode_steps=4).id for each in (Left, Right)]
+    assert names[0] != names[1] == name_given(f"{__name__}:Right.Robot")
+
+
+def test_environments_begin_with_a_reset_and_a_seed():
+    with pytest.raises(InputError, match="reset"):
+        JitterbugVecEnv("face_direction", 1).step(np.zeros((1, 1)))
+    assert "seed" in refused(JitterbugVecEnv, "face_direction", 1, seed=-1)
+
+
+def test_a_likelihood_that_is_not_finite_ends_in_a_line(brief, tmp_path):
+    wild = {"loss": "gaussian", "steps": 200, "overrides": {"learning_rate": 1e6}}
+    assert "diverged" in refused(api.clone, brief, tmp_path / "clone", episodes=1, **wild)
+
+
+def test_a_warning_of_the_robot_s_does_not_hide_its_symmetry(monkeypatch):
+    step = JitterbugEnv.step
+
+    def warned(self, action):
+        warnings.warn("old", DeprecationWarning, stacklevel=2)
+        return step(self, action)
+
+    monkeypatch.setattr(JitterbugEnv, "step", warned)
+    assert _by_turning(describe("face_direction"))[1]

@@ -18,8 +18,7 @@ from wide import wide
 
 from jbrep.encoders import find, save
 from jbrep.errors import DamageError, InputError, Notice
-from jbrep.evaluation import diagnose
-from jbrep.evaluation.diagnosis import SCALARS
+from jbrep.evaluation.diagnosis import SCALARS, diagnose
 from jbrep.evaluation.evaluation import _REGISTERED, Scalar, Score, diagnostic
 from jbrep.evaluation.table import (
     DIAGNOSTICS,
@@ -32,11 +31,20 @@ from jbrep.evaluation.table import (
 from jbrep.play.sources import find_episode
 from jbrep.records.document import document_from, read_document
 from jbrep.records.tables import write_csv, write_rows
-from jbrep.reporting import make_report, report, write_report
+from jbrep.reporting import report
 from jbrep.reporting.evaluation import evaluation_text
 from jbrep.reporting.figures import study_plots, write
 from jbrep.reporting.findings import Findings
-from jbrep.reporting.report import FINDINGS, MARKDOWN, PAGE, commands, results_text, summary
+from jbrep.reporting.report import (
+    FINDINGS,
+    MARKDOWN,
+    PAGE,
+    commands,
+    make_report,
+    results_text,
+    summary,
+    write_report,
+)
 from jbrep.reporting.tables import read_tables
 from jbrep.reporting.views import say, settings_tables, verdict_tables
 from jbrep.rl.files import ENCODER, EVALUATIONS, Evaluation, read_run
@@ -300,7 +308,7 @@ def test_an_unfinished_study_says_what_is_missing(tmp_path):
     assert [*found["missing"]] == [cell.name for cell in plan.cells[-5:]]
     assert len(found["runs"]) == 7
     text = page.read_text()
-    assert "Unfinished: 5 of 12 runs are missing" in text
+    assert "Unfinished: 5 of 12 runs missing" in text
     assert "700</td>" in text
 
 

@@ -105,7 +105,7 @@ def test_the_motion_is_what_was_observed(task, joints):
     """Both observe all positions but the first, then all velocities."""
     rollout = find_episode("uniform", 1, short(task))
     assert 10 < len(rollout) <= 30
-    assert rollout.terminated != rollout.truncated
+    assert rollout.terminated is (len(rollout) < 30)
     assert rollout.motion.qpos.shape == (len(rollout) + 1, joints)
     seen = np.concatenate((rollout.motion.qpos[:, 1:], rollout.motion.arrays["qvel"]), axis=1)
     np.testing.assert_allclose(seen.clip(-10, 10), rollout.observation, rtol=1e-5, atol=1e-6)
@@ -133,7 +133,7 @@ def test_what_comes_out_differently_or_can_t_be_simulated_is_shown_as_stored(hop
 
 
 def test_a_run_is_of_its_task_and_plays_it_for_longer_or_shorter(run):
-    with pytest.raises(InputError, match="is of face_direction, not of move_to_pose"):
+    with pytest.raises(InputError, match="for face_direction, not for move_to_pose"):
         find_player(str(run), describe("move_to_pose"))
     player = find_player(str(run), describe("face_direction", episode_steps=20))
     assert [len(rollout) for rollout in player.play([0])] == [20]

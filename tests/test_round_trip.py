@@ -9,7 +9,8 @@ from command import jbrep
 from jbrep import api
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.envs import describe
-from jbrep.evaluation import diagnose, regression
+from jbrep.evaluation import regression
+from jbrep.evaluation.diagnosis import diagnose
 from jbrep.methods.fit import Fitter
 from jbrep.rl.controller import export, load_policy
 from jbrep.rl.policy_file import find_shipped as find

@@ -9,8 +9,7 @@ import pytest
 from scipy import optimize, stats
 
 from jbrep.errors import InputError
-from jbrep.stats import RunCurve, analyse
-from jbrep.stats.analysis import aggregates, probability_of_improvement, to_plain
+from jbrep.stats.analysis import aggregates, analyse, probability_of_improvement, to_plain
 from jbrep.stats.curves import (
     bands,
     common_grid,
@@ -34,7 +33,7 @@ from jbrep.stats.intervals import (
 from jbrep.stats.labels import components, expected_shortfall
 from jbrep.stats.pairs import linked_units
 from jbrep.stats.rules import Planned, Rules
-from jbrep.stats.runs import groups
+from jbrep.stats.runs import RunCurve, groups
 
 GRID = np.arange(0, 10_001, 1000)
 

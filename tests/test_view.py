@@ -13,7 +13,8 @@ from jbrep.dataset import Dataset, DataSettings, ScaledDataset
 from jbrep.envs import Environments, describe
 from jbrep.envs.names import import_modules
 from jbrep.envs.view import with_view
-from jbrep.evaluation import diagnose, regression
+from jbrep.evaluation import regression
+from jbrep.evaluation.diagnosis import diagnose
 from jbrep.methods.fit import Fitter
 from jbrep.rl.controller import export
 

@@ -3,8 +3,8 @@
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from jbrep.reporting import write_report
 from jbrep.reporting.findings import Findings
+from jbrep.reporting.report import write_report
 from jbrep.reporting.tables import read_tables
 
 RESULTS = Path("results")

@@ -13,7 +13,7 @@ from jbrep.checking.transitions import REPEATS, PlayStats, Transitions, play, re
 from jbrep.coordinates.invariance import NotTheSameError, tried_coordinates
 from jbrep.dataset import Dataset
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, Notice
 from jbrep.records.record import to_plain
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within
 from jbrep.text import Table, counted, duration, facts, interval, terminal_width, wrapped
@@ -172,7 +172,8 @@ def _by_turning(task: Task) -> tuple[list[Finding], bool]:
             made = tried_coordinates(task, "symmetry")
     except InputError as error:
         return [], isinstance(error, NotTheSameError)
-    if caught or not made:  # all rewards were the same, which tells nothing
+    is_noted = any(issubclass(each.category, Notice) for each in caught)
+    if is_noted or not made:  # all rewards were the same, which tells nothing
         return [], False
     why = "turned by a quarter and shifted, the robot goes on and is rewarded alike"
     fix = "--encoder symmetry leaves out place and heading"

@@ -235,10 +235,8 @@ class Relations:
             left = [i for i in left if i not in wrong]
         if not left or len(left) == len(places) - 1:
             return None
-        state, kept = (
-            self.inputs(self._seen.before)[0],
-            [k for k, i in enumerate(places) if i not in left],
-        )
+        state, _ = self.inputs(self._seen.before)
+        kept = [k for k, i in enumerate(places) if i not in left]
         rest, left_out = state[:, ~np.isin(owners, left)], state[:, np.isin(owners, left)]
         less, needed = np.hstack((rest, self._seen.action)), wanted[:, kept]
         of_less, of_left = self._fit((less, needed), (rest, left_out))

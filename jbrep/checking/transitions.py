@@ -83,17 +83,15 @@ def play(task: Task, steps: int, seed: int) -> tuple[Transitions, PlayStats]:
 
 def read(data: Dataset, steps: int, seed: int) -> Transitions:
     """Episodes of a data set, drawn until they have so many steps."""
-    chosen, total = list[int](), 0
-    lengths = data.episodes["length"].tolist()
-    for number in np.random.default_rng(seed).permutation(len(lengths)).tolist():
-        if lengths[number] and total < steps:
-            chosen.append(number)
-            total += lengths[number]
-    if total < _SHORTEST:
+    lengths = data.episodes["length"]
+    order = np.random.default_rng(seed).permutation(len(lengths))
+    before = lengths[order].cumsum() - lengths[order]
+    chosen = np.sort(order[before < steps]).tolist()
+    if (total := int(lengths[chosen].sum())) < _SHORTEST:
         raise InputError(f"{data.folder} has {total} steps: a check needs at least {_SHORTEST}")
     episodes = list[_Columns]()
-    for number in sorted(chosen):
-        episode, n = data.episode(number), min(lengths[number], steps)
+    for number in chosen:
+        episode, n = data.episode(number), min(int(lengths[number]), steps)
         rows = np.concatenate((episode["observation"], episode.record["final_observation"][None]))
         reward = episode["reward"] if "reward" in data.columns else np.full(n, np.nan)
         ended = bool(episode.record["terminated"]) and n == lengths[number]

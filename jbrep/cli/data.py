@@ -74,7 +74,7 @@ def _report(out: Path, write: Callable[[], object]) -> None:
     if rows := len(dataset) - before:
         say(f"{rows:,} rows in {seconds:,.0f} s, {rows / seconds:,.0f} a second")
     else:
-        say("it was complete already: nothing was done")
+        say("already complete: nothing to do")
 
 
 def _report_size(out: Path, manifest: Any) -> None:

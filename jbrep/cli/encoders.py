@@ -191,13 +191,13 @@ def import_model(
         decoder: a model from latents back to observations, if MODEL has no reconstruction.
         name: what tables will call it; by default the name of the file.
     """
-    from jbrep.encoders.encoder import SUFFIX, Encoder, save_new
-    from jbrep.records.storage import exists, taken
+    from jbrep.encoders.encoder import SUFFIX, Encoder, pack
+    from jbrep.records.storage import exists, taken, write_new
 
     if exists(out):
         raise taken(out)
     made = Encoder.from_onnx(model, task, decoder, name or out.name.removesuffix(SUFFIX))
-    save_new(made, out)
+    write_new(out, pack(made))
     say(card(made, str(out), terminal_width()))
 
 

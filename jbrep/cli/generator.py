@@ -93,11 +93,10 @@ class Option(NamedTuple):
         if kind is Literal:
             choices = (str(each) for part in _parts(key.annotation) for each in get_args(part))
             metavar = f"[{'|'.join(sorted(filter(None, choices)))}]"
-        usual = {"is_flag": kind is bool, "multiple": kind in (Mapping, Sequence)}
+        usual = {"is_flag": kind is bool or None, "multiple": kind in (Mapping, Sequence)}
         return click.Option(
             [self.name, key.field],
             required=is_required,
-            default=None,
             metavar=key.extra.get("metavar", metavar),
             help=_with_options(key.help[:1].upper() + key.help[1:], options) + default,
             callback=self.read,
@@ -159,9 +158,9 @@ def options_of(source: Any) -> dict[str, Option]:
             made = options_of(maker)
             main = made.pop(name)
             is_argument = each.kind is _Parameter.POSITIONAL_ONLY
-            own[name] = main._replace(
-                key=main.key._replace(default=default), is_argument=is_argument
-            )
+            default = main.key.default if default is NODEFAULT else default
+            key = main.key._replace(default=default)
+            own[name] = main._replace(key=key, is_argument=is_argument)
             continue
         if each.kind is _Parameter.VAR_KEYWORD:
             for inner in _sources(each):

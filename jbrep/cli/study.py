@@ -52,19 +52,23 @@ def study(
         raise InputError("choose --dry-run or --register")
     if register and (workers or backend != "local"):
         raise InputError("--register runs nothing: leave out --workers and --backend")
-    study = find_study(study)
-    read_toml(study)
+    file = find_study(study)
+    if register and file != study:
+        raise InputError(
+            f"--register writes beside a study's file, and {study} ships: copy {file} and name that"
+        )
+    read_toml(file)
     from jbrep.studies.runner import BACKENDS  # imports torch
 
     choose(backend, BACKENDS, "backend")
     if dry_run and backend != "local":
         raise InputError("--dry-run forecasts this machine alone: leave out --backend")
-    folder = out or Path("runs") / study.stem
+    folder = out or Path("runs") / file.stem
     if dry_run or register:
-        _announce(study, folder, dry_run, workers)
+        _announce(file, folder, dry_run, workers)
         return False
     with stoppable(RESUMES):
-        made = api.study(study, folder, workers=workers, backend=backend)
+        made = api.study(file, folder, workers=workers, backend=backend)
     _show(made)
     return bool(made.tables.raw.record.missing)
 

@@ -12,8 +12,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from msgspec import Meta
 
-from jbrep.cloning.objective import Cloning, PolicyInputs
-from jbrep.cloning.td3_bc import TD3BC
+from jbrep.cloning.objective import TD3BC, Cloning, PolicyInputs
 from jbrep.dataset import Dataset
 from jbrep.encoders import Encoder, save
 from jbrep.encoders.base import BaseEncoder
@@ -108,7 +107,6 @@ class Job(NamedTuple):
     encoder: BaseEncoder
     settings: RunSettings
     how: Cloned
-    given: dict[str, Any]  # settings of the training, by stable-baselines3's names
 
     @classmethod
     def of(
@@ -150,7 +148,7 @@ class Job(NamedTuple):
             hyperparameters=chosen.replace(algorithm_kwargs=given, noise=None, num_envs=1),
             cloned=cloned,
         )
-        return cls(data, found, settings, cloned, given)
+        return cls(data, found, settings, cloned)
 
 
 def learn(
@@ -180,7 +178,7 @@ def _learn(job: Job, folder: Path, threads: int | None) -> None:
     trained = build(settings, job.encoder, folder)._replace(statistics=seen.statistics)
     objective = Cloning(trained.policy, how.chunk)
     if how.method != BC:
-        objective = TD3BC(trained.policy, how.alpha, job.given)
+        objective = TD3BC(trained.policy, how.alpha, settings.hyperparameters.algorithm_kwargs)
     trainer, watched = _train(job, objective, seen, folder / _CHECKPOINT)
     objective.load_state_dict(trainer.best)
     objective.eval()
@@ -238,9 +236,10 @@ def _train(
     settings, device = job.settings, get_device(job.settings.device)
     objective.to(device)
     count = count_windows(seen, objective.horizon)
-    size = min(job.given["batch_size"], count)
+    given = settings.hyperparameters.algorithm_kwargs
+    size = min(given["batch_size"], count)
     epochs = math.ceil(settings.steps / math.ceil(count / size))
-    schedule = Schedule(epochs, size, job.given["learning_rate"], settings.seed)
+    schedule = Schedule(epochs, size, given["learning_rate"], settings.seed)
     watched = watched_windows(seen, objective.horizon, device)
     windows = Windows(seen, seen.train, objective.horizon, device)
     trainer = Trainer(objective, schedule, windows, watched)

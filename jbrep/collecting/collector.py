@@ -169,7 +169,7 @@ def _plain(settings: DataSettings) -> dict[str, Any]:
 
 
 def usual_shard_episodes(
-    settings: DataSettings, folder: Path, policy: Policy | None = None, retries: int = 0
+    settings: DataSettings, folder: Path, policy: Policy, retries: int = 0
 ) -> int:
     """Episodes in a shard of the usual size, judging by the data set's first few.
 
@@ -183,7 +183,6 @@ def usual_shard_episodes(
     if not task.reproducible:
         return max(1, round(settings.steps / length / MOST_SHARDS))
     if task.terminates is not False:
-        policy = policy or make_policy(settings.policy)
         simulator = Simulator(settings, policy, retries=retries)
         played = simulator.made(range(_PILOT), lambda steps: None)
         length = np.mean([steps for each in played for steps in each[EPISODES + "length"]])

@@ -39,7 +39,7 @@ def replay_problems(
             some = chosen[first : first + size]
             recording = simulate_again(some, read, bar.update, num_threads)
             for index, episode in enumerate(some):
-                if not _is_equal(recording, index, episode):
+                if not is_equal(recording, index, episode):
                     yield (
                         f"{dataset.folder}: episode {episode.number} simulated again differs: use "
                         "the robot as it was, on the machine it was made on, with these versions: "
@@ -75,7 +75,8 @@ def simulate_again(
         return record(envs, open_loop(chain(actions, afterwards)), tick, read)
 
 
-def _is_equal(recording: Recording, index: int, episode: Episode) -> bool:
+def is_equal(recording: Recording, index: int, episode: Episode) -> bool:
+    """Whether a recorded environment went through an episode, to the last bit."""
     length, stored = len(episode), episode.record
     ends_there = recording.length[index] == length and bool(recording.terminated[index])
     if recording.length[index] < length or ends_there != bool(stored["terminated"]):
@@ -84,7 +85,8 @@ def _is_equal(recording: Recording, index: int, episode: Episode) -> bool:
     if not episode.dataset.manifest.settings.reward:  # or else the environment gives others
         pairs.append((recording.reward[:length, index], episode["reward"]))
     states: dict[str, NDArray[Any]] = {"observation": recording.observation, **recording.arrays}
-    for name, values in states.items():
+    for name in states.keys() & episode.dataset.columns:
+        values = states[name]
         pairs.append((values[:length, index], episode[name]))
         pairs.append((values[length, index], stored[f"final_{name}"]))
     for name, values in recording.start.items():

@@ -12,7 +12,7 @@ from jbrep.coordinates.coordinates import Coordinates
 from jbrep.coordinates.made import Ingredient, System, make_coordinates
 from jbrep.envs.isolation import isolated
 from jbrep.envs.make import action_in, make_env
-from jbrep.envs.names import spec_of
+from jbrep.envs.names import INSTANCE, spec_of
 from jbrep.envs.physics import quarter_turn
 from jbrep.envs.task import Array, Task
 from jbrep.envs.view import Window
@@ -80,6 +80,10 @@ def _not_the_same(task: Task, what: str, as_it_is: float, turned: float) -> NotT
 
 
 def _tried(task: Task) -> list[tuple[Array, Array]]:
+    if task.id.startswith(INSTANCE):
+        raise InputError(
+            f"symmetry can't be tried on {task.name}, of which there is one: give its class"
+        )
     envs: list[gymnasium.Env[Any, Any]] = []
     try:
         for _ in range(2):

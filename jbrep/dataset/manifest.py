@@ -271,6 +271,6 @@ def range_problems(task: Task, columns: Columns) -> Iterator[str]:
             if feature.bounded and feature.low is not None and feature.high is not None
         ]
     for name, values, low, high in ranges:
-        if len(values) and not np.float32(low) <= values.min() <= values.max() <= np.float32(high):
+        if not np.float32(low) <= values.min() <= values.max() <= np.float32(high):
             extent = f"ranges from {values.min():g} to {values.max():g}"
             yield f"{name} {extent}, beyond [{low:g}, {high:g}]"

@@ -18,6 +18,7 @@ from jbrep.dataset.manifest import check_sizes, open_shard, read_manifest
 from jbrep.dataset.scaling import EXTREMA, Scaler, extrema, fit_scaler, mean_and_std
 from jbrep.dataset.schema import Columns, episode_bounds, episode_columns
 from jbrep.dataset.settings import policy_text
+from jbrep.envs.card import range_text
 from jbrep.errors import DamageError, InputError
 from jbrep.text import Table, counted, facts, number
 
@@ -248,7 +249,7 @@ class Dataset:
         about, rows = self.describe(), []
         for each in about.pop("features"):
             low, high = each["nominal"]
-            usual = "-" if low is None else f"[{number(low, '.4g')}, {number(high, '.4g')}]"
+            usual = "-" if low is high is None else range_text(low, high)
             values = [number(each[name], ".4g") for name in _RANGES[2:6]]
             rows.append((each["feature"], each["unit"], *values, usual))
         sizes = counted(self.task.size, "feature"), counted(self.task.action_size, "action")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jbrep.dataset import settings
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, refusing
-from jbrep.records.record import pattern, to_plain
+from jbrep.records.record import Record, pattern, to_plain
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -33,7 +33,7 @@ _Code = Annotated[
 
 
 class Spec(NamedTuple):
-    """Type of a column and shape of one of its rows; how it follows from others, if it does."""
+    """Type of a column, shape of a row, and what computes it from other columns, if anything."""
 
     dtype: np.dtype[Any]
     row: tuple[int, ...] = ()
@@ -44,9 +44,13 @@ def _spec(dtype: str, *row: int, follows: Callable[[Columns], NDArray[Any]] | No
     return Spec(np.dtype(dtype), row, follows)
 
 
-class DataSettings(settings.CollectSettings, frozen=True, kw_only=True):
+class DataSettings(Record, frozen=True, kw_only=True):
     """What determines the data, and how they are divided into shards."""
 
+    steps: settings.Steps
+    seed: settings.RootSeed = 0
+    shard_episodes: settings.ShardEpisodes = 100
+    store_state: settings.StoreState = False
     task: Task = msgspec.field(name="environment")
     policy: settings.PolicySettings = msgspec.field(default_factory=lambda: {"kind": "uniform"})
     unrewarded: Literal[True] | UnsetType = UNSET  # imported data that have no rewards

@@ -5,8 +5,6 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from jbrep.records.record import Record
-
 IMPORTED = "imported"  # data that were made elsewhere
 MIXTURE = "mixture"  # a policy for each episode, by weights
 TRAINED = "trained"  # of a run, kept in a file beside the shards
@@ -32,15 +30,6 @@ ShardEpisodes = Annotated[
     ),
 ]
 StoreState = Annotated[bool, Meta(description="Store the Jitterbug's qpos and qvel, too.")]
-
-
-class CollectSettings(Record, frozen=True, kw_only=True):
-    """How much is collected, and how it is stored."""
-
-    steps: Steps
-    seed: RootSeed = 0
-    shard_episodes: ShardEpisodes = 100
-    store_state: StoreState = False
 
 
 def parts_of(policy: PolicySettings) -> list[PolicySettings]:

@@ -20,7 +20,6 @@ Float32 = NDArray[np.float32]
 OWN = "own"  # the kind of a user's own encoder
 _NAME = re.compile(r"[\w.-]{1,100}", re.ASCII)
 _PROBES = 256  # observations by whose latents an own encoder is known
-_SPREAD = 1.0  # of these, in the features' usual ranges
 _SAME = 1e-2  # by which a latent may differ in another batch, of the largest: rounding, TF32
 
 
@@ -41,7 +40,7 @@ class BaseEncoder(ABC):
 
     @property
     def not_decoded(self) -> tuple[str, ...]:
-        """Features that symmetry leaves out, such as where a robot is; decoded, it is at 0."""
+        """Features that symmetry leaves out, such as position: decoded, they are 0."""
         return ()
 
     def comparable(self, decoded: Any, observation: Any) -> Any:
@@ -125,7 +124,7 @@ class OwnEncoder(BaseEncoder):
 
     @property
     def _probes(self) -> Float32:
-        scaled = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, (_PROBES, self.size))
+        scaled = np.random.default_rng(0).uniform(-1, 1, (_PROBES, self.size))  # usual ranges
         return self.task.unscale(scaled).astype(np.float32)
 
     def _check_repeats(self, latents: Float32) -> None:
@@ -136,7 +135,7 @@ class OwnEncoder(BaseEncoder):
             if not np.allclose(again, latents[:count], rtol=_SAME, atol=near):
                 raise InputError(
                     f"{self.name} returned other latents for the same observations {when}: an "
-                    "encoder must keep no state, draw nothing, and take each row by itself"
+                    "encoder must be deterministic, keep no state, and encode each row by itself"
                 )
 
     def encode(self, observation: Any) -> Float32:

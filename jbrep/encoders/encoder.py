@@ -20,7 +20,7 @@ from jbrep.errors import InputError
 from jbrep.records import container
 from jbrep.records.container import Tensors
 from jbrep.records.document import document_from
-from jbrep.records.storage import make_folder, write_new, write_whole
+from jbrep.records.storage import write_whole
 
 if TYPE_CHECKING:
     from torch.nn import Module
@@ -257,19 +257,14 @@ def _imported(
     return made
 
 
+def pack(encoder: Encoder) -> bytes:
+    """The bytes of an encoder's file."""
+    return container.pack(encoder.tensors(), encoder.header.as_json())
+
+
 def save(encoder: Encoder, path: Path) -> None:
     """Write an encoder's file, whole or not at all."""
-    write_whole(path, _packed(encoder))
-
-
-def save_new(encoder: Encoder, path: Path) -> None:
-    """The same of a file that doesn't exist yet."""
-    make_folder(path.parent)
-    write_new(path, _packed(encoder))
-
-
-def _packed(encoder: Encoder) -> bytes:
-    return container.pack(encoder.tensors(), encoder.header.as_json())
+    write_whole(path, pack(encoder))
 
 
 def load(path: Path) -> Encoder:
@@ -289,19 +284,15 @@ def unpack(path: Path, tensors: Tensors, header: dict[str, Any]) -> Encoder:
 def _encoder(header: EncoderHeader, tensors: Tensors) -> Encoder:
     if header.kind != IMPORTED and type(header.metrics.get(HELD_OUT_MSE)) is not float:
         raise InputError(f"the header's metrics have no {HELD_OUT_MSE}, or not as a float")
-    encoder = _layers("encoder", header.encoder, tensors)
-    decoder = _layers("decoder", header.decoder, tensors)
+    encoder, decoder = (
+        tuple(_layer(f"{part}.{i}", name, tensors) for i, name in enumerate(getattr(header, part)))
+        for part in ("encoder", "decoder")
+    )
     made = Coordinates(header.environment, header.coordinates) if header.coordinates else None
     scaler = Scaler(_take(tensors, "low"), _take(tensors, "high"), made, header.clip)
     if tensors:
         raise InputError(f"unexpected tensor {min(tensors)}")
     return Encoder(header, scaler, encoder, decoder, header.keep)
-
-
-def _layers(part: str, activations: tuple[str, ...], tensors: Tensors) -> Layers:
-    return tuple(
-        _layer(f"{part}.{i}", activation, tensors) for i, activation in enumerate(activations)
-    )
 
 
 def _layer(name: str, activation: str, tensors: Tensors) -> "Layer | Model":

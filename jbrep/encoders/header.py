@@ -62,9 +62,7 @@ class EncoderHeader(Document, frozen=True):
     ] = None
     keep: Annotated[
         _Words,
-        Meta(
-            description="Features, or coordinates, that pass around the layers and follow the code."
-        ),
+        Meta(description="Features, or coordinates, that skip the layers and follow the code."),
     ] = ()
     encoder: Annotated[
         _Words, Meta(description="The activation after each layer; `onnx` for a model.")

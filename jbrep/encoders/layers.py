@@ -1,6 +1,5 @@
 """Dense layers and their activations, for NumPy arrays and torch tensors alike."""
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any, NamedTuple
@@ -14,11 +13,8 @@ MAX_UNITS = 4096  # in a layer
 MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
 
 ONNX = "onnx"  # in place of an activation: a layer that is a model
-LAYER_NORM = "layer-norm"
 AVG_L1_NORM = "avg-l1-norm"
 LEAST_NORM = 1e-8  # that an average magnitude counts as
-EPSILON = 1e-5  # added to the variance in a layer norm
-_SATURATED = 10.0  # from where tanh in the approximate GELU is 1 in float64
 
 
 class Layer(NamedTuple):
@@ -52,7 +48,7 @@ class Layer(NamedTuple):
 
 
 def dense(weight: Any, bias: Any, activation: str = "linear") -> Layer:
-    """A layer from float64."""
+    """A dense layer, stored in float32, of weights computed in float64."""
     single = np.ascontiguousarray(weight, dtype=np.float32)
     return Layer(single, np.asarray(bias, np.float32), activation)
 
@@ -81,7 +77,6 @@ def activate(name: str, values: Any) -> Any:
 
     They are a NumPy array, a torch tensor, or something that has `activations` of its own.
 
-    `layer-norm` is over the units, without weights of its own: an affine map after it has them.
     `avg-l1-norm` divides them by their average magnitude (Fujimoto et al. 2023).
     """
     if is_torch(values):
@@ -100,31 +95,16 @@ def _gelu(values: Any) -> Any:
     return values * ndtr(values)
 
 
-def _gelu_tanh(values: Any) -> Any:
-    near = np.clip(values, -_SATURATED, _SATURATED)
-    return 0.5 * values * (1 + np.tanh(math.sqrt(2 / math.pi) * (near + 0.044715 * near**3)))
-
-
-def _layer_norm(values: Any) -> Any:
-    wide = np.asarray(values, np.float64)
-    centred = wide - wide.mean(-1, keepdims=True)
-    variance = np.square(centred).mean(-1, keepdims=True)
-    return (centred / np.sqrt(variance + EPSILON)).astype(values.dtype)
-
-
 ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {  # for NumPy arrays
     "linear": lambda values: values,
     "relu": lambda values: values.clip(min=0),
     "tanh": np.tanh,
     "sigmoid": _sigmoid,
     "gelu": _gelu,  # Hendrycks and Gimpel 2016
-    "gelu-tanh": _gelu_tanh,  # their approximation of it
     "silu": lambda values: values * _sigmoid(values),
     "elu": lambda values: np.where(values > 0, values, np.expm1(np.minimum(values, 0))),
     "leaky-relu": lambda values: np.maximum(values, 0.01 * values),
-    "softplus": lambda values: np.logaddexp(values, 0),
     "sin": np.sin,
-    LAYER_NORM: _layer_norm,
     AVG_L1_NORM: lambda values: values / np.abs(values).mean(-1, keepdims=True).clip(LEAST_NORM),
 }
 
@@ -138,9 +118,7 @@ def _torch() -> Mapping[str, Callable[[Any], Any]]:
         "linear": lambda values: values,
         "relu": lambda values: values.clip(min=0),
         **{name: getattr(torch, name) for name in ("tanh", "sigmoid", "sin")},
-        **{name: getattr(functional, name) for name in ("gelu", "silu", "elu", "softplus")},
+        **{name: getattr(functional, name) for name in ("gelu", "silu", "elu")},
         "leaky-relu": functional.leaky_relu,
-        "gelu-tanh": lambda values: functional.gelu(values, approximate="tanh"),
-        LAYER_NORM: lambda values: functional.layer_norm(values, values.shape[-1:], eps=EPSILON),
         AVG_L1_NORM: lambda v: v / v.abs().mean(-1, keepdim=True).clip(min=LEAST_NORM),
     }

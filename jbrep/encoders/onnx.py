@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from onnx import TensorProto, compose, helper, numpy_helper, version_converter
 
 from jbrep.encoders.encoder import Encoder
-from jbrep.encoders.layers import AVG_L1_NORM, EPSILON, LAYER_NORM, LEAST_NORM
-from jbrep.records.storage import exists, make_folder, taken, write_new
+from jbrep.encoders.layers import AVG_L1_NORM, LEAST_NORM
+from jbrep.records.storage import write_new
 
 _OPSET, _IR_VERSION = 17, 8
 _LATER, _LATER_IR_VERSION = 20, 9  # of models with GELU, or with others in them
@@ -142,13 +142,11 @@ def _node(operator: str, **attributes: Any) -> Callable[[_Rows], _Rows]:
 
 _ACTIVATIONS: Mapping[str, Callable[[_Rows], _Rows]] = {
     "linear": lambda values: values,
-    **{name: _node(name.capitalize()) for name in ("relu", "tanh", "sigmoid", "softplus", "sin")},
+    **{name: _node(name.capitalize()) for name in ("relu", "tanh", "sigmoid", "sin")},
     "gelu": _node("Gelu", approximate="none"),
-    "gelu-tanh": _node("Gelu", approximate="tanh"),
     "silu": lambda values: values * values.made("Sigmoid", values),
     "elu": _node("Elu", alpha=1.0),
     "leaky-relu": _node("LeakyRelu", alpha=0.01),
-    LAYER_NORM: lambda v: v.made("LayerNormalization", v, np.ones(v.width), epsilon=EPSILON),
     AVG_L1_NORM: lambda v: v / np.maximum(abs(v) @ np.full((v.width, 1), 1 / v.width), LEAST_NORM),
 }
 
@@ -160,9 +158,6 @@ def export(encoder: Encoder, path: Path) -> None:
     and, if there is a decoder, `reconstruction`, (n, d) in physical units. Its metadata has the
     header, which describes the environment.
     """
-    if exists(path):
-        raise taken(path)
-    make_folder(path.parent)
     write_new(path, model(encoder).SerializeToString(deterministic=True))
 
 

@@ -90,6 +90,8 @@ class JitterbugVecEnv(VecEnv):
         observation_space, action_space = agent_spaces(task, self._encoder)
         self._actions = np.zeros((num_envs, task.action_size))
         super().__init__(num_envs, observation_space, action_space)
+        if seed < 0:
+            raise InputError(f"seed is {seed}: it must be at least 0")
         self.seed(seed)
 
     def reset(self) -> Float32:

@@ -74,6 +74,8 @@ class AutoresetEnvironments:
 
     def step(self, actions: Array) -> AutoresetStep:
         """Hold an action in every environment for its steps; actions (n, k)."""
+        if not self.envs.num_active:
+            raise InputError("no episode has begun: reset the environments first")
         self._taken.append(actions)
         step, reward, non_finite = self._hold(actions)
         ended, observation, length = ~self.envs.active, step.observation, self.envs.steps

@@ -27,7 +27,7 @@ def _facts(task: "Task") -> Iterator[tuple[str, str]]:
     if task.arguments:
         yield "arguments", ", ".join(task.given_arguments)
     yield "observation", counted(task.size, "feature")
-    bounds = map(_range, task.action_low, task.action_high)
+    bounds = map(range_text, task.action_low, task.action_high)
     yield "action", f"{counted(task.action_size, 'number')} in {', '.join(dict.fromkeys(bounds))}"
     if task.action_names:
         yield "actions", ", ".join(task.action_names)
@@ -38,7 +38,7 @@ def _facts(task: "Task") -> Iterator[tuple[str, str]]:
     else:
         yield "terminates", "yes: a state can end an episode" if task.terminates else "no"
     if task.reward_low is not None or task.reward_high is not None:
-        yield "reward", f"in {_range(task.reward_low, task.reward_high)}"
+        yield "reward", f"in {range_text(task.reward_low, task.reward_high)}"
     if task.solved_return is not None:
         yield "solved", f"from a return of {task.solved_return:,g}"
     if task.state:
@@ -51,13 +51,14 @@ def _facts(task: "Task") -> Iterator[tuple[str, str]]:
         yield "reproducible", f"no: {found} differ, so {lost}"
 
 
-def _range(low: float | None, high: float | None) -> str:
+def range_text(low: float | None, high: float | None) -> str:
+    """Limits, of which either may be unknown, for people: [-1, inf]."""
     ends = ["-inf" if low is None else f"{low:g}", "inf" if high is None else f"{high:g}"]
     return f"[{', '.join(ends)}]"
 
 
 def _cells(feature: "Feature") -> tuple[str, ...]:
     known = feature.low is not None or feature.high is not None
-    usual = _range(feature.low, feature.high) if known else "-"
+    usual = range_text(feature.low, feature.high) if known else "-"
     kind = ", ".join(filter(None, (feature.kind, feature.frame)))
     return feature.name, feature.unit or "-", usual, kind

@@ -2,7 +2,7 @@
 
 import json
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,7 @@ def read_bounds(given: Bounds | str | None) -> Bounds:
     parts: Any = given.tolist() if isinstance(given, np.ndarray) else given or ()
     if isinstance(parts, str):
         parts = [each.split("..") for each in parts.split(",")]
-    elif parts and not any(isinstance(each, Sequence) for each in parts):
+    elif parts and not (np.iterable(parts) and any(map(np.iterable, parts))):
         parts = [parts]
     return converted(parts, Bounds, "action_bounds", strict=False)
 
@@ -216,11 +216,12 @@ def changeable(task: Task) -> tuple[str, ...]:
 
 def spread(task: Task) -> tuple[float, ...]:
     """The standard deviation of each feature in episodes of random actions, (D,)."""
-    return _spread(json.dumps(to_plain(task.whole.undisturbed), sort_keys=True))
+    made = creator(spec_of(task))  # a class may be defined anew
+    return _spread(json.dumps(to_plain(task.whole.undisturbed), sort_keys=True), made)
 
 
 @lru_cache(maxsize=8)
-def _spread(plain: str) -> tuple[float, ...]:
+def _spread(plain: str, made: Any) -> tuple[float, ...]:
     task = from_plain(json.loads(plain), Task)
     several = _SPREAD_EPISODES if is_batched(task) else 1
     low, high = task.action_low, task.action_high

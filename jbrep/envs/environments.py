@@ -99,7 +99,6 @@ class Step(NamedTuple):
     reward: Array  # (n,) 0 in an environment whose episode had ended before
     terminated: Flags  # (n,) true from the step on that ended the episode
     truncated: Flags  # (n,) likewise; also where the physics diverged
-    arrays: Mapping[str, Array]  # those of the task's `state` and `constants`, (n, width) each
 
 
 class Environments:
@@ -216,16 +215,7 @@ class Environments:
         self.lost = getattr(self._batch, "lost", self.lost)
         self._steps -= self.lost
         self._count()
-        return Step(observation, reward, terminated, truncated, arrays)
-
-    @property
-    def metadata(self) -> Mapping[str, Any]:
-        """What an environment says of itself, such as its `render_fps`."""
-        return self._batch.metadata
-
-    def render(self) -> Sequence[Any]:
-        """What each environment draws, as its `render_mode` says."""
-        return self._batch.render()
+        return Step(observation, reward, terminated, truncated)
 
     def abandon(self) -> None:
         """Leave all episodes as if they had ended."""
@@ -282,7 +272,6 @@ class Separate:
         except BaseException:
             self.close()
             raise
-        self.metadata: Mapping[str, Any] = self.instances[0].metadata
         self._flat = flattener(self.instances[0].observation_space)
         self._action_space = self.instances[0].action_space
         self._offset = task.offset if task.offset.any() else None
@@ -407,10 +396,13 @@ class Separate:
         if self._task.missing == "skip" and self._steps[index] > 1:
             raise _MissingError
         if not after_step or self._held[index] > most_held(self._task.missing or ""):
+            fix = "`missing` says what to do, such as hold:3, or skip if it isn't in the first step"
+            if most := most_held(self._task.missing or ""):
+                fix = f"no more than {most} steps in a row may be"
             raise EnvironmentFailedError(
                 f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
-                f"reward that is not finite in 32 bits, {self._where(index)}: `missing` says what "
-                "to do, such as hold:3, or skip if it isn't in an episode's first step"
+                f"reward that is not finite in 32 bits, {self._where(index)}: "
+                f"{fix if after_step else 'an episode must begin with all of them'}"
             )
         filled = np.where(missing, self._observation[index], flat)
         return filled, self._last_reward[index] if is_missing else reward
@@ -433,10 +425,6 @@ class Separate:
                 f"{self._task.name} failed {self._where(index)}: {kind_and_line(error)}"
             )
         self._retries[index].failed(error)
-
-    def render(self) -> tuple[Any, ...]:
-        with isolated():
-            return tuple(env.render() for env in self.instances)
 
     @property
     def numbers(self) -> list[Numbers]:

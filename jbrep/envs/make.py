@@ -35,14 +35,12 @@ _NO_LIMIT = -1  # as gymnasium.make takes it
 
 
 def make_env(
-    env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None = None, **options: Any
+    env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None = None
 ) -> Env:
     """One instance, as Gymnasium makes it; without a time limit it has the registered one."""
     spec = find_spec(env_id)
-    if max_episode_steps is not None:
-        options["max_episode_steps"] = max_episode_steps  # None would lift the registered limit
     with _making(env_id, arguments):
-        return gymnasium.make(spec, disable_env_checker=True, **{**arguments, **options})
+        return gymnasium.make(spec, max_episode_steps, disable_env_checker=True, **arguments)
 
 
 def make_batch(task: Task, num_envs: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:

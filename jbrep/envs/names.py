@@ -11,7 +11,7 @@ import sysconfig
 import warnings
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from functools import cache
+from functools import cache, reduce
 from importlib import import_module, metadata
 from itertools import count
 from operator import attrgetter
@@ -138,10 +138,15 @@ def name_given(text: str) -> str:
     module, colon, name = text.rpartition(":")
     if colon:
         import_modules([module])
-        known = vars(sys.modules[module]).get(name)
+        known = _found(sys.modules[module], name)
         if name not in gymnasium.registry and isinstance(known, type):
             return taken_for(known)[0]
     return name
+
+
+def _found(module: Any, path: str) -> Any:
+    """What a module has at a path such as Outer.Env; None if there is nothing."""
+    return reduce(lambda part, name: getattr(part, name, None), path.split("."), module)
 
 
 # environments that no id is registered for
@@ -156,10 +161,11 @@ def taken_for(given: Any) -> tuple[str, dict[str, Any], int | None]:
     if isinstance(given, str):
         return given, {}, None
     if isinstance(given, type) and issubclass(given, gymnasium.Env):
-        module, name = given.__module__, f"{given.__module__.replace('.', '-')}/{given.__name__}"
+        module, path = given.__module__, given.__qualname__
+        name = f"{module.replace('.', '-')}/{path.rpartition('<locals>.')[2]}"
         if module not in (*_imported, "__main__"):  # other processes import it, too
             _imported.append(module)
-        if "<locals>" in given.__qualname__:  # a function may make several of that name
+        if "<locals>" in path:  # a function may make several of that name
             name = _numbered(name, given)
         return _registered(name, given), {}, None
     if not isinstance(given, gymnasium.Env):
@@ -167,7 +173,7 @@ def taken_for(given: Any) -> tuple[str, dict[str, Any], int | None]:
     made = given.spec
     if made and made.id in gymnasium.registry and not made.additional_wrappers:
         usual = {**gymnasium.spec(made.id).kwargs, "render_mode": made.kwargs.get("render_mode")}
-        differing = {n: v for n, v in made.kwargs.items() if n not in usual or usual[n] != v}
+        differing = {n: v for n, v in made.kwargs.items() if repr(usual.get(n)) != repr(v)}
         return made.id, differing, made.max_episode_steps
     name = _numbered(f"{INSTANCE}{type(given.unwrapped).__name__}", given)
     lent = _Lent(given)
@@ -199,7 +205,7 @@ class _Lent(gymnasium.Wrapper[Any, Any, Any, Any]):
 def _register_class_of(name: str) -> None:
     """Register the class that an id names as MODULE/CLASS, if a user had that module imported."""
     module, _, kind = name.partition("/")
-    known = getattr(imported(module.replace("-", ".")), kind, None)
+    known = _found(imported(module.replace("-", ".")), kind)
     if name not in gymnasium.registry and isinstance(known, type):
         taken_for(known)
 

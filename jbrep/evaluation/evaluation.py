@@ -192,10 +192,6 @@ class Scalar(NamedTuple):
     better: int = 1  # 1 if higher is better, -1 if lower is
     is_first: bool = False  # whether it is among the first that a user sees
 
-    def read(self, known: Diagnostics) -> Score | None:
-        """Its score, if an evaluation has it."""
-        return known.scores.get(self.name)
-
 
 SCALARS: dict[str, Scalar] = {}  # by name; complete where jbrep.evaluation.diagnosis is
 _REGISTERED: list[tuple[Callable[[Judged], Any], tuple[str, ...]]] = []

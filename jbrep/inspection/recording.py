@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Sequence
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,6 @@ Colour = tuple[int, int, int]
 SKY, ORANGE, GREEN, PURPLE = (86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167)
 VERMILION, YELLOW, BLUE, GREY = (213, 94, 0), (240, 228, 66), (0, 114, 178), (160, 160, 160)
 _COLOURS: tuple[Colour, ...] = (SKY, ORANGE, GREEN, PURPLE, VERMILION, YELLOW, BLUE, GREY)
-
-
-def palette(count: int) -> list[Colour]:
-    """As many colours as asked for; they repeat after eight."""
-    return [_COLOURS[i % len(_COLOURS)] for i in range(count)]
 
 
 def pieces(path: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -91,9 +87,8 @@ class Recording:
     ) -> None:
         """Send the lines (rows, lines) of a plot, whose names have units; width is in points."""
         lines = len(names)
-        style = rr.SeriesLines(
-            names=names, colors=colours or palette(lines), widths=[width] * lines
-        )
+        colours = colours or [*islice(cycle(_COLOURS), lines)]
+        style = rr.SeriesLines(names=names, colors=colours, widths=[width] * lines)
         self.send(path, style)
         self.send_columns(path, times, rr.Scalars.columns(scalars=values))
 
@@ -112,5 +107,5 @@ def check_out(path: Path) -> None:
         if path.suffix != SUFFIX:
             name = path.with_suffix(SUFFIX)
             raise InputError(f"a recording is a file such as {name}, not {path}")
-    elif not path.is_file() or path.read_bytes()[: len(_MAGIC)] != _MAGIC:
+    elif not path.is_file() or path.open("rb").read(len(_MAGIC)) != _MAGIC:
         raise InputError(f"{path} exists and is not a Rerun recording: choose another `out`")

@@ -24,8 +24,8 @@ class Full(ClosedForm, frozen=True, kw_only=True):
 
     def check(self) -> None:
         super().check()
-        if self.on != self.defaults()["on"]:
-            raise InputError(f"{self.name} is on {self.defaults()['on']}: for another, see `kind`")
+        if self.on != (own := self.defaults()["on"]):
+            raise InputError(f"{self.name} is on {own}: for another, see `kind`")
 
     def make(self, data: ScaledDataset) -> Made:
         return Made((), ())
@@ -44,7 +44,7 @@ class InCoordinates(Full, frozen=True, kw_only=True):
 
 
 class InSymmetry(Full, frozen=True, kw_only=True):
-    """The same without what shifting and turning the world changes."""
+    """Coordinates that shifting and turning the world leaves as they are, scaled."""
 
     name: ClassVar[str] = "symmetry"
 
@@ -133,7 +133,7 @@ class Untrained(Network, ClosedForm, frozen=True, kw_only=True):
 
 
 class Fourier(Coded, ClosedForm, frozen=True, kw_only=True):
-    """Sines of random directions, in which functions of the observation are nearly linear."""
+    """Random Fourier features, in which functions of the observation are nearly linear."""
 
     name: ClassVar[str] = "fourier"
     min_reduction: ClassVar[int | None] = None

@@ -39,7 +39,7 @@ _SMALL = 1e-6  # standard deviation of a target that says nothing
 
 
 class LinearForward(Directions, frozen=True, kw_only=True):
-    """What a row says linearly, beyond the actions, of what comes next.
+    """The linear latent that best predicts what comes next, given the actions.
 
     It is reduced-rank regression of that on the row and the actions (Izenman 1975; predictive
     states: Littman et al. 2001). Targets, at each horizon k: the change of each number over k
@@ -161,7 +161,7 @@ def change(now: Array, then: Array, turn: Array) -> Array:
 
 
 class Forward(Network, Learned, frozen=True, kw_only=True):
-    """What a network needs, beside the actions, to predict changes and rewards to come.
+    """Latent of a network that predicts changes and rewards to come, given the actions.
 
     S-RL Toolbox, Raffin et al. 2018; OFENet, Ota et al. 2020. The scale of a code says nothing to
     its predictors, so it is made standard.

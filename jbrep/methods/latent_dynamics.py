@@ -24,7 +24,7 @@ _SMALL = 1e-6  # standard deviation of a reward that says nothing
 
 
 class DeepMDP(Network, Learned, frozen=True, kw_only=True):
-    """A latent from which reward and next latent follow smoothly, with the action."""
+    """Latent that predicts reward and next latent by Lipschitz functions, given the action."""
 
     name: ClassVar[str] = "deepmdp"
 
@@ -122,7 +122,7 @@ class DeepMDPObjective(Objective):
 
 
 class SelfPrediction(Network, Learned, frozen=True, kw_only=True):
-    """A latent that tells, with the action, the next one; on a mean magnitude of 1 (SALE)."""
+    """Latent that predicts the next one, given the action; of mean magnitude 1 (SALE)."""
 
     name: ClassVar[str] = "self-prediction"
 

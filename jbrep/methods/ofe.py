@@ -21,7 +21,7 @@ from jbrep.training.settings import LearningRate
 
 
 class OFE(Learned, frozen=True, kw_only=True):
-    """The observation with features beside it, from which the next one follows (OFENet)."""
+    """The observation and features that help predict the next one (OFENet)."""
 
     name: ClassVar[str] = "ofe"
     min_reduction: ClassVar[int | None] = None

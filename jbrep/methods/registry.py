@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pkgutil import resolve_name
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 from msgspec.structs import asdict
 
@@ -68,13 +68,6 @@ def named_settings(
     ]
 
 
-class Recipe(NamedTuple):
-    """A method with the settings that a name says."""
-
-    method: type[Method]
-    given: dict[str, Any]
-
-
 def name_of(method: Method) -> str:
     """What an encoder is called: method, what is unusual about it, and latent size."""
     words, settings, usual = [method.name], asdict(method), method.defaults()
@@ -90,7 +83,7 @@ def name_of(method: Method) -> str:
     return str(EncoderName("-".join(words), size))
 
 
-def read_name(name: str) -> Recipe:
+def read_name(name: str) -> tuple[type[Method], dict[str, Any]]:
     """The method and settings that a name stands for: the inverse of `name_of`."""
     stem, latent, _ = EncoderName.parse(name)
     mistake = InputError(f"unknown representation {name!r}: {_EXAMPLES}")
@@ -108,4 +101,4 @@ def read_name(name: str) -> Recipe:
         raise mistake from None
     if named != name:
         raise mistake
-    return Recipe(method, given)
+    return method, given

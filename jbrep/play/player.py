@@ -80,7 +80,6 @@ class Player(NamedTuple):
             action=recording.action[:steps, index],
             reward=recording.reward[:steps, index],
             terminated=bool(recording.terminated[index]),
-            truncated=bool(recording.truncated[index]),
             motion=read.motion(recording, index, steps),
             encoder=self.encoder,
         )

@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collecting.replay import simulate_again
+from jbrep.collecting.replay import is_equal, simulate_again
 from jbrep.dataset import Dataset, Episode
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.physics import Motion, MotionReader
-from jbrep.envs.recording import Recording
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 
@@ -25,7 +24,6 @@ class Rollout:
     action: NDArray[np.floating]  # (n, k)
     reward: NDArray[np.float32]  # of each step, (n,)
     terminated: bool  # whether a state ended the episode
-    truncated: bool  # whether the time limit did, or physics that diverged
     motion: Motion | None = None  # of the robot, n + 1 states; None where there is no MuJoCo
     note: str = ""  # why there is no motion though the environment may have one
     encoder: BaseEncoder | None = None  # of a trained policy that doesn't observe all features
@@ -45,15 +43,13 @@ def replay(dataset: Dataset, episode: int) -> Rollout:
     Where that isn't possible here, or leads elsewhere, it is as stored, with a note and no motion.
     """
     stored = dataset.episode(episode)
-    if not len(stored):
-        raise InputError(f"episode {episode} of {dataset.folder} has no steps: choose another")
     rollout = _as_stored(stored)
     read = MotionReader()
     try:
         recording = simulate_again([stored], read, tick=lambda steps: None)
     except (InputError, ModuleNotFoundError) as error:
         return replace(rollout, note=f"{rollout.name} is shown without the robot: {error}")
-    if not _is_same(recording, rollout, bool(dataset.manifest.settings.reward)):
+    if not is_equal(recording, 0, stored):
         note = (
             f"{rollout.name} is shown as stored, without the robot: simulated again it differs, as "
             f"{dataset.task.name} isn't reproducible here"
@@ -73,17 +69,4 @@ def _as_stored(episode: Episode) -> Rollout:
         action=episode["action"],
         reward=episode["reward"] if "reward" in episode.dataset.columns else unknown,
         terminated=bool(ends["terminated"]),
-        truncated=bool(ends["truncated"]),
     )
-
-
-def _is_same(recording: Recording, rollout: Rollout, own_rewards: bool) -> bool:
-    """Whether the first environment went through the rollout, to the last bit.
-
-    Rewards of the user's own are not among it: the environment gives others.
-    """
-    steps = len(rollout)
-    pairs = [(recording.observation[: steps + 1, 0], rollout.observation)]
-    if not own_rewards:
-        pairs.append((recording.reward[:steps, 0], rollout.reward))
-    return all(again.tobytes() == before.tobytes() for again, before in pairs)

@@ -42,10 +42,11 @@ def find_episode(
     """
     if exists(Path(source) / MANIFEST):
         dataset = Dataset(source)
-        _check_task(source, dataset.task, task)
+        if task:
+            check_same(task, dataset.task, source)
         if task not in (None, dataset.task):
             raise InputError(
-                f"{source} has its own arguments, time limit and features: leave out --task"
+                f"{source} has its own arguments, time limit and features: leave out `task`"
             )
         return replay(dataset, episode)
     return find_player(source, task, encoder).play_one(episode)
@@ -139,7 +140,7 @@ def find_player(source: Any, task: Task | None = None, encoder: Any = None) -> P
 
 def _needed(task: Task | None, policy: str) -> Task:
     if task is None:
-        raise InputError(f"policy {policy} needs a --task")
+        raise InputError(f"policy {policy} needs a `task`")
     return task
 
 
@@ -197,17 +198,11 @@ def _trained(source: str, task: Task | None, encoder: Any) -> Player:
         raise InputError(_OWN_ENCODER.format(source))
     trained = load_run(folder, encoder) if folder else of_file(read(policy_file(source, task)))
     name = str(folder or source)
-    _check_task(name, trained.task, task)
+    if task:
+        check_same(task, trained.task, name)
     if trained.step is not None:
         name = f"{name} at step {trained.step:,}"
     return as_player(name, trained, task)
-
-
-def _check_task(source: str, own: Task, given: Task | None) -> None:
-    if given and given.id != own.id:
-        raise InputError(f"{source} is of {own.name}, not of {given.name}")
-    if given:
-        check_same(given, own, source)
 
 
 def as_player(name: str, trained: "Trained", task: Task | None = None) -> Player:
@@ -270,7 +265,7 @@ def _exported(path: Path, task: Task | None) -> Player:
     if sizes != (known.size, said.chunk * known.action_size):
         raise InputError(
             f"{path} takes {sizes[0]} numbers and gives {sizes[1]}, but {known.name} observes "
-            f"{known.size} and acts by {known.action_size}: give its --task"
+            f"{known.size} and acts by {known.action_size}: give its `task`"
         )
 
     def act(observation: Array) -> NDArray[Any]:

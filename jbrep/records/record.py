@@ -40,6 +40,8 @@ Sha256 = Annotated[str, pattern(r"\A[0-9a-f]{64}\Z", "a SHA-256: 64 hexadecimal 
 
 _FIELD = re.compile(r"Object (missing required|contains unknown) field `(.*)`")
 _FRACTION = re.compile(r"\A([+-]?)(\.[0-9]+(?:e[+-]?[0-9]+)?)\Z")  # of a number without its 0
+_JSON_TYPES = re.compile(r"`([^`]*)`")  # in msgspec's messages
+_WORDS = {"array": "a list", "object": "a table", "str": "text"}
 _STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]")
 _WITH_PARTS = (
     *(inspect.StructType, inspect.NamedTupleType, inspect.DictType),
@@ -52,14 +54,14 @@ _TOO_LARGE = 10**18  # of a whole number that is given as text
 class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, dict=True):
     """A frozen record whose fields are checked when it is made, in Python or from a file.
 
-    A list is taken for a tuple, a whole number for a float, a NumPy scalar for Python's.
+    A list is taken for a tuple, a whole number for a float, what NumPy has for Python's own.
     """
 
     def __post_init__(self) -> None:
         for field in msgspec.structs.fields(type(self)):
             value = getattr(self, field.name)
             if field.type is not Any and value is not UNSET:
-                fitting = converted(_of_python(value), field.type, field.encode_name)
+                fitting = converted(value, field.type, field.encode_name)
                 force_setattr(self, field.name, fitting)
         self.check()
 
@@ -110,7 +112,8 @@ def _whole(text: str, where: str) -> int:
 def converted(value: Any, kind: Any, where: str, strict: bool = True) -> Any:
     """As `from_plain`, for types that aren't classes; not strict of numbers that are text."""
     try:
-        return msgspec.convert(value if strict else with_zeros(value), kind, strict=strict)
+        plain = _of_python(value) if strict else with_zeros(_of_python(value))
+        return msgspec.convert(plain, kind, strict=strict)
     except msgspec.ValidationError as error:
         raise InputError(_line(str(error), value, kind, where)) from None
     except RecursionError:
@@ -144,12 +147,18 @@ def _line(message: str, value: Any, kind: Any, where: str) -> str:
         must_be = reason.removeprefix("Expected ").partition(", got")[0]
         if "matching regex" in must_be:
             must_be = next((words for _, words in found if words), must_be)
+        must_be = _JSON_TYPES.sub(_in_words, must_be)
     elif reason.startswith("Invalid "):
         must_be = _choices(nodes, "one of ") or "another"
     else:  # what `check` said
         return f"{place}: {reason}" if place else reason
     given = "" if value is UNSET else f" is {shown(value)}: it"
     return f"{place or 'it'}{given} must be {must_be}"
+
+
+def _in_words(types: re.Match[str]) -> str:
+    every = [_WORDS.get(each, each) for each in types[1].split(" | ") if each != "null"]
+    return " or ".join(every)
 
 
 def _inside(value: Any, step: str) -> Any:
@@ -207,7 +216,12 @@ def to_plain(value: Any) -> Any:
 
 
 def _of_python(value: Any) -> Any:
-    return value.item() if hasattr(value, "dtype") and not getattr(value, "shape", 0) else value
+    """NumPy's numbers and arrays, in lists and tables, too, as Python's."""
+    if hasattr(value, "dtype") and hasattr(value, "tolist"):
+        return value.tolist()
+    if type(value) is dict:
+        return {name: _of_python(each) for name, each in value.items()}
+    return [*map(_of_python, value)] if type(value) in (list, tuple) else value
 
 
 def _python_scalar(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -175,9 +175,9 @@ class Scaling(Record, frozen=True, kw_only=True):
 class Findings(Document, frozen=True, kw_only=True):
     """All that a report says."""
 
-    format: ClassVar[str] = "jbrep findings"
-    format_version: ClassVar[int] = 1
-    indent: ClassVar[int] = 1
+    format = "jbrep findings"
+    format_version = 1
+    indent = 1
 
     name: str
     title: str
@@ -215,13 +215,14 @@ class Findings(Document, frozen=True, kw_only=True):
         labels, planned = record.labels, record.planned
         settings = [label.settings for label in labels.values()]
         own = (each.representation for each in settings if each.encoder == EACH_ITS_OWN)
+        seen = in_order((each.representation for each in settings), FULL)
         top = planned.rules.top
         return cls(
             name=tables.name,
-            title=(record.study.title if record.study else "") or _title(tables),
+            title=(record.study.title if record.study else "") or _title([*record.tasks], seen),
             tasks=[*record.tasks],
             algorithms=[*dict.fromkeys(each.learner for each in settings)],
-            representations=in_order((each.representation for each in settings), FULL),
+            representations=seen,
             own_encoders=in_order(own, FULL),
             baseline=analysis.baseline if analysis else record.baseline,
             top=top if isinstance(top, str) else "",
@@ -383,10 +384,8 @@ def _scaling(labels: Sequence[Label]) -> Scaling | None:
         for each in full
     }
     states, of_codes = (
-        sorted(
-            {e.encoder.data.get("train_rows") or 0 for e in labels if (e in full) == is_full} - {0}
-        )
-        for is_full in (True, False)
+        sorted({*filter(None, (each.encoder.data.get("train_rows") for each in some))})
+        for some in (full, [each for each in labels if each.settings.representation != FULL])
     )
     return Scaling(ways=sorted(ways), states=states, of_codes=of_codes)
 
@@ -418,13 +417,10 @@ def _settings(tables: Tables) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _title(tables: Tables) -> str:
+def _title(tasks: Sequence[str], seen: Sequence[str]) -> str:
     """What was studied, where its file has no title."""
-    seen = in_order(
-        (label.settings.representation for label in tables.raw.record.labels.values()), FULL
-    )
     shown = ", ".join(seen) if len(seen) <= _MOST_NAMED else f"{len(seen)} representations"
-    return f"{', '.join(tables.raw.record.tasks)}: {shown}"
+    return f"{', '.join(tasks)}: {shown}"
 
 
 def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -8,9 +8,9 @@ from typing import NamedTuple
 from jbrep.errors import InputError, listed
 from jbrep.evaluation.table import by_label
 from jbrep.reporting.diagnostics import read_known
-from jbrep.stats import Analysis, RunCurve, analyse
+from jbrep.stats.analysis import Analysis, analyse
 from jbrep.stats.curves import common_grid
-from jbrep.stats.runs import groups
+from jbrep.stats.runs import RunCurve, groups
 from jbrep.stats.scale import BLIND
 from jbrep.studies import tables as study
 from jbrep.studies.record import RunsRecord
@@ -86,12 +86,10 @@ def _without_refused(runs: list[RunCurve], baseline: str) -> tuple[list[RunCurve
 
 def _prevented(record: RunsRecord, references: References) -> dict[str, str]:
     """Why there are no verdicts on tasks, by name, where what scores 0 or 1 isn't known."""
-    named = record.planned.rules.reference
-    needed = (*BLIND, named) if isinstance(named, str) and named else BLIND
-    tasks = {record.settings_of(run).task for run in record.runs}
+    needed = [*BLIND, *filter(None, [record.planned.rules.policy])]
     unknown = {
         task: [policy for policy in needed if policy not in references.get(task, {})]
-        for task in tasks
+        for task in record.tasks
     }
     return {
         task: f"what {listed(policies)} would return isn't known, by which returns are scored: "

@@ -13,7 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from jbrep.evaluation.evaluation import Score
 from jbrep.reporting.findings import Agents, Comparison, Findings, Group, RunFound, Verdict
 from jbrep.stats.scale import LOOKING
-from jbrep.text import SIGNIFICANT, Table, interval, number, r2_text, rounded, wrapped
+from jbrep.text import SIGNIFICANT, Table, counted, interval, number, r2_text, rounded, wrapped
 
 Cells = Mapping[str, Callable[[Any], str]]  # of a row, by the heads of columns
 _MOST_DIGITS = 9  # after the point
@@ -51,6 +51,7 @@ def _environment(is_page: bool) -> Environment:
     )
     found.filters |= {
         "number": number,
+        "counted": counted,
         "markdown": lambda part: markdown(part) if isinstance(part, Table) else escape(part),
         "text": in_text,
     }
@@ -175,7 +176,7 @@ def verdict_cells(verdict: Verdict) -> dict[str, str]:
         "level": "-" if verdict.level is None else _level(verdict.level),
         "boundary": number(verdict.boundary),
         "p": probability(verdict.p),
-        "units": f"{verdict.units} {'encoders' if verdict.by_encoder else 'runs'}",
+        "units": counted(verdict.units, "encoder" if verdict.by_encoder else "run"),
     }
 
 

@@ -112,9 +112,7 @@ def make_agent(
         of_class["action_noise"] = noise_of(hyperparameters.noise, size, episode_steps)
     with (
         warnings.catch_warnings(record=True) as caught,
-        refusing(
-            "there is no room for the agent and its buffer", (MemoryError,), describe=one_line
-        ),
+        refusing("not enough memory for the replay buffer", (MemoryError,), describe=one_line),
     ):
         agent: Any = sb3_class(algorithm)(
             "MlpPolicy",
@@ -149,11 +147,6 @@ def global_random_state_kept() -> Iterator[None]:
     finally:
         np.random.set_state(numpy_state)  # noqa: NPY002
         random.setstate(python_state)
-
-
-def action_repeat(agent: BaseAlgorithm) -> int:
-    """Control steps for which each action of an agent is held; 1 if it doesn't say."""
-    return int(getattr(agent, "action_repeat", 1))
 
 
 class ColouredActionNoise(ActionNoise):
@@ -288,6 +281,7 @@ def evaluate(
     What it normalises, it normalises by its statistics so far, which stay as they are.
     """
     preprocess = preprocessor(encoder.encode, statistics_of(agent))
-    act, repeat = deterministic_actor(agent.policy, envs.task, preprocess), action_repeat(agent)
+    act = deterministic_actor(agent.policy, envs.task, preprocess)
+    repeat = getattr(agent, "action_repeat", 1)
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + episodes, envs.num_envs)
     return joined((whole_outcome(envs, lambda: held(act, repeat), s) for s in seeds), episodes)

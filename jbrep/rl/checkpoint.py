@@ -144,7 +144,7 @@ def standing(
     if header is None:
         raise InputError(
             f"the run in {folder} can't go on: {CHECKPOINT} is missing; choose another folder, "
-            "perhaps with `begin_from`"
+            "perhaps beginning with its policy, `begin_from`"
         )
     if others := differences(header.versions, versions):
         raise InputError(

@@ -16,6 +16,7 @@ from jbrep.coordinates import library_of
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder, load
 from jbrep.encoders.layers import ACTIVATIONS, Layer, activate, dense, run
+from jbrep.encoders.shipped import find
 from jbrep.envs.task import most_held
 from jbrep.envs.view import Window
 from jbrep.errors import InputError, choose, listed, refusing
@@ -100,7 +101,6 @@ class Controller:
         view = self.task.view
         self._names = self.task.feature_names[: len(view.places) if view else None]
         self.hold = most_held(self.task.missing or "")
-        self._one_row = isinstance(encoder, Encoder)
         self.reset()
 
     def __repr__(self) -> str:
@@ -142,8 +142,8 @@ class Controller:
         if max(left_out, *missed) > hold:
             name = self._names[int(np.argwhere(lacking)[0, -1])] if lacking.any() else "observation"
             raise InputError(
-                f"no finite {name} for more than {hold} steps in a row: the policy's `hold` says "
-                "how many may pass; reset() begins anew"
+                f"{name} is missing or not finite: the policy's `hold` allows that for {hold} "
+                "steps in a row; reset() begins anew"
             )
         if self._given is not None:
             rows = np.where(lacking, np.atleast_2d(self._given), rows)
@@ -178,7 +178,10 @@ class Controller:
             return np.full_like(self._given, np.nan)
         names = self._names
         try:
-            given = _numbers(observation)
+            given: NDArray[Any] = np.ma.asanyarray(observation)
+            if given.dtype.kind not in "fiub" or np.ma.is_masked(given) or not given.size:
+                raise TypeError
+            given = np.asarray(given, np.float32)
         except (TypeError, ValueError, OverflowError, RuntimeError):
             raise InputError(
                 f"the observation is a {type(observation).__name__}: the policy takes {len(names)} "
@@ -200,8 +203,6 @@ class Controller:
         return given[..., : len(names)]
 
     def _chosen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        if observation.ndim == 1 and not self._one_row:
-            return self._chosen(observation[None])[0]
         action = self.acting.actions(self.encoder.encode(observation))
         if not np.isfinite(action).all():
             raise InputError(
@@ -256,7 +257,8 @@ def load_policy(source: str | Path, encoder: Any = None) -> Controller:
     path = path.parent if path.name == POLICY_ZIP and is_run(path.parent) else path
     if path.is_file():
         file = read(path)
-        return _of_file(file, file.encoder())
+        task = file.header.settings.environment
+        return _of_file(file, file.encoder() if encoder is None else find(encoder, task))
     if exists(path / RUN) and exists(path / ENCODER) and encoder is None:
         _, sha256 = read_finished(path)
         return _of_file(read(path / POLICY, sha256), load(path / ENCODER))
@@ -268,7 +270,7 @@ def load_policy(source: str | Path, encoder: Any = None) -> Controller:
     return Controller(trained.settings, trained.encoder, weights, trained.statistics)
 
 
-def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
+def _of_file(file: PolicyFile, encoder: BaseEncoder) -> Controller:
     settings, weights = file.header.settings, file.weights
     if encoder.fingerprint != settings.encoder:
         raise InputError(f"{file.path} is of a run on another encoder than {encoder.name}")
@@ -333,14 +335,6 @@ def described(controller: Controller) -> dict[str, Any]:
         "steps": settings.steps,
         "seed": settings.seed,
     }
-
-
-def _numbers(observation: Any) -> NDArray[np.float32]:
-    """An observation's numbers, none of them masked."""
-    given: NDArray[Any] = np.ma.asanyarray(observation)
-    if given.dtype.kind not in "fiub" or np.ma.is_masked(given) or not given.size:
-        raise TypeError
-    return np.asarray(given, np.float32)
 
 
 def _onnx(controller: Controller) -> bytes:

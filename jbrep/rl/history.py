@@ -3,11 +3,11 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import takewhile
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
-import numpy as np
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 from torch.utils.tensorboard import SummaryWriter
 
@@ -32,21 +32,19 @@ class History:
     infos: list[Info] = field(default_factory=list)
     seconds_before: float = 0.0  # wall time of earlier processes [s]
     first_step: int = 0  # the training step from which this process continues
-    # mean return of each evaluation; progress asks for it at every rollout
-    means: list[float] = field(init=False)
     _started: float = field(default_factory=time.monotonic)
-
-    def __post_init__(self) -> None:
-        self.means = self._means()
 
     @property
     def seconds(self) -> float:
         """The wall time so far."""
         return round(self.seconds_before + time.monotonic() - self._started, 1)
 
-    def _means(self) -> list[float]:
-        by_step = groupby(self.evaluations, lambda each: each.step)
-        return [float(np.mean([each.episode_return for each in own])) for _, own in by_step]
+    @property
+    def last_mean(self) -> float | None:
+        """The mean return of the last evaluation; None before the first."""
+        last = self.evaluations[-1:]
+        own = takewhile(lambda each: each.step == last[0].step, reversed(self.evaluations))
+        return fmean(each.episode_return for each in own) if last else None
 
     def add(self, step: int, outcome: Outcome) -> None:
         """Record an evaluation after so many steps."""
@@ -54,13 +52,11 @@ class History:
         self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(returns)]
         numbered = enumerate(outcome.numbers)
         self.infos += [Info(step, i, *each) for i, numbers in numbered for each in numbers.items()]
-        self.means.append(float(np.mean(returns)))
 
     def drop_from(self, step: int) -> None:
         """Drop the evaluations after so many steps, or more."""
         self.evaluations = [row for row in self.evaluations if row.step < step]
         self.infos = [row for row in self.infos if row.step < step]
-        self.means = self._means()
 
 
 class Bar:
@@ -88,7 +84,7 @@ class Bar:
             )
         is_final = self._progress.n < self._steps <= step
         self._progress.update(min(step, self._steps) - self._progress.n)
-        last = rounded(history.means[-1])[0] if history.means else "-"
+        last = "-" if history.last_mean is None else rounded(history.last_mean)[0]
         shown = "final ones under way" if is_final else last
         self._progress.set_postfix(returns=shown, refresh=is_final)
 

@@ -30,14 +30,6 @@ class Statistics:
     count: float  # of observations
 
     @classmethod
-    def untrained(cls, size: int) -> "Statistics":
-        """Those that a run begins with."""
-        from stable_baselines3.common.running_mean_std import RunningMeanStd
-
-        start = RunningMeanStd(shape=(size,))
-        return cls(start.mean, start.var, start.count)
-
-    @classmethod
     def of(cls, env: "VecNormalize") -> "Statistics":
         """Those of an environment so far."""
         running = _running(env)

@@ -82,7 +82,7 @@ _REFUSED = {  # arguments that are jbrep's own, with the reason
         _NO_SDE,
     ),
 }
-_NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "net_arch"}
+_NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule"}
 
 
 def overridden(algorithm: str, preset: str, overrides: Mapping[str, Any]) -> Hyperparameters:
@@ -125,6 +125,8 @@ def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> 
         return before.replace(policy_kwargs={**before.policy_kwargs, name: checked})
     if name == "optimizer_kwargs" and isinstance(value, dict):
         value = {**before.optimizer_kwargs, **value}
+    if name == "net_arch" and type(value) is int:
+        value = [value]
     if name == "warm_up":
         before = before.learning_from(argument(algorithm, before, "learning_starts"))
     after = before.replace(**{name: _or_none(value)})

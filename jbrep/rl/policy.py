@@ -96,7 +96,7 @@ class Trained(NamedTuple):
     def with_weights(self, weights: Tensors, tensors: Tensors, source: Path) -> "Trained":
         """The policy with weights of the part that acts, and statistics among tensors."""
         fill(acting(self.policy), weights, source)
-        if self.statistics is None:
+        if not self.settings.hyperparameters.normalize:
             return self
         return self._replace(statistics=Statistics.read(tensors, self.encoder.latent_size))
 
@@ -138,8 +138,7 @@ def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
     with refusing(what, errors, describe=one_line), global_random_state_kept():
         spaces = Spaces(*agent_spaces(task, encoder, settings.chunk))
         agent = make_agent(settings.algorithm, small, spaces, settings.seed)
-    statistics = Statistics.untrained(encoder.latent_size) if shape.normalize else None
-    return Trained(agent.policy, task, encoder, settings, None, statistics)
+    return Trained(agent.policy, task, encoder, settings)
 
 
 def pack(trained: Trained, run: str) -> bytes:
@@ -301,8 +300,6 @@ class Frozen:
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Act deterministically; nothing is drawn."""
         header, trained = _opened(self.file, self.content)
-        if task.id != trained.task.id:
-            raise InputError(f"{header.run} is of {trained.task.name}, not of {task.name}")
         check_same(task, trained.task, header.run)
         return trained.one_by_one()
 

@@ -7,7 +7,6 @@ from msgspec import Meta
 from jbrep.errors import InputError
 from jbrep.records.record import Record, pattern
 
-CPU, CUDA = "cpu", "cuda"
 BC: Final = "bc"  # behaviour cloning
 MAX_STEPS = 10**12  # of training
 MAX_EPISODES = 10_000  # of an evaluation
@@ -53,15 +52,15 @@ class CloneSettings(Record, frozen=True, kw_only=True):
         Meta(
             ge=1,
             le=1000,
-            description="Cloning: actions that are chosen at once and played before the policy "
-            "looks again.",
+            description="Cloning: actions that are predicted at once, and played before the policy "
+            "observes again.",
         ),
     ] = 1
     patience: Annotated[
         int, Meta(ge=1, description="Cloning: epochs without a lower held-out loss that end it.")
     ] = 10
     alpha: Annotated[
-        float, Meta(gt=0, le=10**6, description="TD3+BC: weight of the value in its actor.")
+        float, Meta(gt=0, le=10**6, description="TD3+BC: weight of Q in the actor's loss.")
     ] = 2.5
 
     def check(self) -> None:

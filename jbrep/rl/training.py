@@ -284,7 +284,7 @@ class _Progress(BaseCallback):
         outcome = evaluate(self.model, self._envs, self._job.encoder, episodes)
         logger = self.model.logger
         self._history.add(self._step, outcome)
-        logger.record("evaluation/mean_return", self._history.means[-1])
+        logger.record("evaluation/mean_return", self._history.last_mean)
         for name, values in by_name(outcome.numbers).items():
             logger.record(f"evaluation/{name}", fmean(values))
         logger.dump(self.model.num_timesteps)

@@ -72,9 +72,9 @@ class GroupAnalysis:
     algorithm: str
     grid: Array  # training steps at which runs are compared, (g,)
     cut: str | None  # which evaluations the grid leaves out, in words; None if it leaves out none
-    return_floor: float  # the least possible return of the task; NaN if unknown
-    return_ceiling: float  # the largest possible one; NaN if unknown
-    failure_return: float  # what a failed run counts as from the step of failure on
+    return_floor: float | None  # the least possible return of the task; None if unknown
+    return_ceiling: float | None  # the largest possible one; None if unknown
+    failure_return: float | None  # what a failed run counts as from the step of failure on
     ends: Ends  # the returns that score 0 and 1
     blind: Interval  # the return that shows whether agents learned, as in `Scale`
     # mean returns of policies that don't learn, each with its 95 % interval over starts
@@ -164,9 +164,9 @@ def _analyse_group(
         task=first.task,
         algorithm=first.algorithm,
         cut=known.cut,
-        return_floor=_or_nan(first.return_floor),
-        return_ceiling=_or_nan(first.return_ceiling),
-        failure_return=_or_nan(first.failure_return),
+        return_floor=first.return_floor,
+        return_ceiling=first.return_ceiling,
+        failure_return=first.failure_return,
         references=played,
         labels=(baseline, *others),
         comparisons=tuple(compare(each, baseline, known, seed) for each in others),
@@ -185,21 +185,17 @@ def _scores(groups: Sequence[GroupAnalysis]) -> dict[str, dict[str, dict[str, Ar
     return scores
 
 
-def _or_nan(value: float | None) -> float:
-    return np.nan if value is None else float(value)
-
-
 def compare(
     label: RepresentationResult, baseline: RepresentationResult, known: Compared, seed: int
 ) -> Comparison:
     """A representation against the baseline of the same task and algorithm."""
-    pairs = {name: (label.by_run[name], baseline.by_run[name]) for name in label.by_run}
-    finals, runs = pairs["final_return"], (len(label.seeds), len(baseline.seeds))
+    finals = label.by_run["final_return"], baseline.by_run["final_return"]
     found = paired(known, label.representation, baseline.representation)
     numbers = _differences(found, seed) if found else dict.fromkeys(_PAIRED, UNDEFINED)
-    numbers["variance_ratio"] = unless_few(variance_ratio(*finals), *runs)
-    better = percentile(probability_of_improvement, *finals, seed=seed)
-    numbers["probability_of_improvement"] = better
+    numbers["variance_ratio"] = variance_ratio(*finals)
+    numbers["probability_of_improvement"] = percentile(
+        probability_of_improvement, *finals, seed=seed
+    )
     return Comparison(
         representation=label.representation,
         numbers=numbers,

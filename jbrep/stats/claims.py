@@ -36,7 +36,6 @@ class Claim(NamedTuple):
     # two-sided, of the estimand lying on the boundary, from a pair, the boundary and a seed
     p_value: Callable[[Pair, float, int], float]
     is_of_returns: bool = False  # whether the estimate is a difference of returns
-    is_ratio: bool = False  # whether the estimate is a ratio, whose logarithm is symmetrical
     takes_learning: bool = True  # whether it says nothing where agents on y don't learn
     # the estimate with the interval that the test itself keeps, if that is another
     tested: Callable[[Pair, float, int], Interval] | None = None
@@ -211,6 +210,5 @@ LESS_VARIABLE = Claim(
     estimate=lambda pair, level, seed: ratio_of_spreads(_curves(pair), level, seed),
     tested=lambda pair, level, seed: ratio_of_spreads(_curves(pair), level, seed, PERMUTATIONS),
     p_value=lambda pair, boundary, seed: spread_p(_curves(pair), seed),
-    is_ratio=True,
 )
 CLAIMS = {claim.name: claim for claim in (BETTER, NOT_WORSE, FASTER, LESS_VARIABLE)}

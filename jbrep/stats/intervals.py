@@ -25,7 +25,6 @@ from jbrep.stats.bootstrap import Array, Interval
 LEVEL = 0.95
 RESAMPLES = 2000
 UNDEFINED = Interval(np.nan, np.nan, np.nan)
-_FEWEST_FOR_RATIOS = 3  # with two runs Bonett's interval of a ratio covers 86 %
 _FEWEST_PAIRS = 5  # or families for an interval: with fewer, ranks agree by chance too often
 FEWEST_RUNS = 4  # for an interval: three or fewer are better shown as points
 
@@ -92,11 +91,12 @@ def variance_ratio(x: Array, y: Array, level: float = LEVEL) -> Interval:
     Bonett 2006, "Robust confidence interval for a ratio of standard deviations", Applied
     Psychological Measurement 30: a normal interval of the log ratio, whose error has the kurtosis
     pooled over both groups. His correction for groups of unequal size is left out, as it breaks
-    down for levels near 1. The interval is NaN where a group has only two runs or doesn't vary.
+    down for levels near 1. The interval is NaN where a group has fewer runs than FEWEST_RUNS or
+    doesn't vary.
     """
     n, m = x.shape[-1], y.shape[-1]
     (quartic_x, squares_x), (quartic_y, squares_y) = _moments(x), _moments(y)
-    known = ~constant(x) & ~constant(y) & (min(n, m) >= _FEWEST_FOR_RATIOS)
+    known = ~constant(x) & ~constant(y) & (min(n, m) >= FEWEST_RUNS)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = (squares_x / (n - 1)) / (squares_y / (m - 1))
         kurtosis = (n + m) * (quartic_x + quartic_y) / (squares_x + squares_y) ** 2

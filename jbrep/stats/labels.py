@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.stats import binomtest, chi2, f, iqr, median_abs_deviation
@@ -28,6 +29,7 @@ _TAIL = 0.25  # of runs: a smaller part of so few would be the worst run alone
 # of the variance of final returns, where each of several encoders has several runs
 COMPONENTS = ("encoder_variance", "run_variance", "encoder_variance_ratio")
 _TAILS = (1 + LEVEL) / 2, (1 - LEVEL) / 2
+_median = partial(np.median, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +177,7 @@ def _numbers(
     for name in ("final_return", "mean_return"):
         values = by_run[name]
         numbers[f"{name}_mean"] = _mean(values, encoders, bounds)
-        numbers[f"{name}_median"] = percentile(median, values, seed=seed)
+        numbers[f"{name}_median"] = percentile(_median, values, seed=seed)
         numbers[f"{name}_iqm"] = percentile(iqm, values, seed=seed)
     for name in ("gain", "score", "rise"):
         numbers[name] = _mean(by_run[name], encoders, Bounds())
@@ -187,7 +189,7 @@ def _numbers(
     )
     numbers["risk_across_runs"] = percentile(expected_shortfall, final, seed=seed)
     for name in STEPS_TO:
-        numbers[name] = percentile(median, by_run[name], seed=seed)
+        numbers[name] = percentile(_median, by_run[name], seed=seed)
         numbers[REACHED[name]] = _share_reached(by_run[name])
     return numbers
 
@@ -205,11 +207,6 @@ def expected_shortfall(values: Array, tail: float = _TAIL) -> Array:
         return ordered[..., 0]
     weights = np.clip(mass - np.arange(values.shape[-1]), 0, 1)
     return ordered @ weights / mass
-
-
-def median(values: Array) -> Array:
-    """The median over runs, (..., n), some of which may be infinite."""
-    return np.median(values, axis=-1)
 
 
 def _share_reached(steps: Array) -> Interval:

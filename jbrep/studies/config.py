@@ -459,8 +459,10 @@ def as_study(given: Mapping[str, Any]) -> Study:
         given["tasks"] = [own.name or own.task for own in each]
         if described := {own.name or own.task: own for own in each if {*own.said} - {"task"}}:
             given["described"] = described
-    if type(given.get("seeds")) is int and 0 < given["seeds"] <= _MOST_SEEDS:
-        given["seeds"] = [*range(given["seeds"])]
+    if type(seeds := given.get("seeds")) is int:
+        if not 0 < seeds <= _MOST_SEEDS:
+            raise InputError(f"seeds is {seeds}: it must be 1 to {_MOST_SEEDS:,}, or a list")
+        given["seeds"] = [*range(seeds)]
     if isinstance(tables := given.get("algorithms"), dict):
         learners = {name: _learner(name, table).table for name, table in tables.items()}
         given["algorithms"] = [*tables]

@@ -336,7 +336,7 @@ class Plan:
         """The folder of the encoders that the study trains for a task."""
         return self.folder / "encoders" / slug(task)
 
-    def data(self, task: str, number: int = 0, name: str = "") -> Path:
+    def data(self, task: str, number: int, name: str) -> Path:
         """The folder of a data set that the study collects for a task, one of several or alone.
 
         Args:
@@ -344,8 +344,7 @@ class Plan:
             number: of the data set.
             name: of the data; empty for those of the only table.
         """
-        several = name in self.study.named_data and self.study.sets(name) > 1
-        of_set = [f"set-{number}"] if several else []
+        of_set = [f"set-{number}"] if self.study.sets(name) > 1 else []
         return self.folder.joinpath("data", *([name] if name else []), slug(task), *of_set)
 
     def check_folder(self) -> None:
@@ -399,8 +398,8 @@ class Plan:
             self.registration.write(self.folder / REGISTRATION)
         elif self.registration.sha256 != registration.sha256:
             raise InputError(
-                f"{self.folder} holds the study as it was registered otherwise, on "
-                f"{self.registration.date[:10]}: choose another `out`"
+                f"{self.folder} was registered on {self.registration.date[:10]} with another "
+                "registration: choose another `out`"
             )
 
     def check_new(self) -> None:

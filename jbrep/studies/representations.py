@@ -14,9 +14,10 @@ from jbrep.encoders.encoder import SUFFIX
 from jbrep.encoders.header import check_name, of_seed
 from jbrep.envs.names import is_code
 from jbrep.errors import InputError
-from jbrep.methods.registry import Recipe, get_method, read_name
+from jbrep.methods.registry import get_method, read_name
 from jbrep.records.record import Record, converted, from_plain, pattern
 from jbrep.text import slug
+from jbrep.training.method import Method
 from jbrep.training.settings import BatchSize, Epochs, LearningRate, NoiseDeviation, Seed
 
 Given = str | dict[str, Any]  # a representation in a study's file: a name or a table
@@ -172,8 +173,8 @@ def read_representation(given: Given, training: Mapping[str, Any]) -> Representa
         training: settings of encoders that the study trains, other than the usual.
     """
     if isinstance(given, str):
-        recipe = read_name(given)
-        return ByName(name=given, kind=recipe.method.name, training=_training(recipe, training))
+        method, own = read_name(given)
+        return ByName(name=given, kind=method.name, training=_training(method, own, training))
     try:
         return _of_table(given, training)
     except InputError as error:
@@ -189,19 +190,19 @@ def _of_table(given: Mapping[str, Any], training: Mapping[str, Any]) -> Represen
             return from_plain(given, ByFile)
         case {"code": _}:
             return from_plain(given, ByCode)
-        case {"kind": str(kind), **own}:
-            recipe = Recipe(get_method(kind), own)
+        case {"kind": str(kind), **rest}:
+            method, own = get_method(kind), rest
         case _ if beside and not settings:
-            recipe = read_name(name)
+            method, own = read_name(name)
         case _:
             raise InputError(
                 "it must have a name and one of file, code, kind (with settings), encoders (a "
                 "number) or data"
             )
     check_name(name)
-    fitted = _training(recipe, training)
-    recipe.method.of(fitted)
-    representation = ByName(name=name, kind=recipe.method.name, training=fitted, **beside)
+    fitted = _training(method, own, training)
+    method.of(fitted)
+    representation = ByName(name=name, kind=method.name, training=fitted, **beside)
     if representation.encoders is not None and "seed" in fitted:
         raise InputError(
             f"its encoders have the seeds 0 to {representation.encoders - 1}: leave out seed"
@@ -209,8 +210,10 @@ def _of_table(given: Mapping[str, Any], training: Mapping[str, Any]) -> Represen
     return representation
 
 
-def _training(recipe: Recipe, training: Mapping[str, Any]) -> dict[str, Any]:
+def _training(
+    method: type[Method], own: Mapping[str, Any], training: Mapping[str, Any]
+) -> dict[str, Any]:
     """The settings of an encoder: what all encoders of a study share, as far as it takes them."""
     from_plain(training, _Training, "training")
-    taken = {key: value for key, value in training.items() if recipe.method.takes(key)}
-    return {**taken, **recipe.given}
+    taken = {key: value for key, value in training.items() if method.takes(key)}
+    return {**taken, **own}

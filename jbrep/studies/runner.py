@@ -16,7 +16,6 @@ from jbrep.records.storage import exclusive, exists, make_folder, write_note
 from jbrep.rl import Session, StoppedError, train
 from jbrep.rl.files import runs_below
 from jbrep.rl.history import History
-from jbrep.rl.settings import CPU, CUDA
 from jbrep.rl.training import drop_checkpoint, standing_of
 from jbrep.studies.plan import (
     PROGRESS,
@@ -88,7 +87,8 @@ class _Progress:
         before, first = self._reported
         if now - before >= _TELL_EVERY:
             rate = f", {(step - first) / (now - before):,.0f} a second" if first else ""
-            mean = f", mean return {history.means[-1]:.4g}" if history.means else ""
+            last = history.last_mean
+            mean = "" if last is None else f", mean return {last:.4g}"
             say(f"{self._name}: {step:,} of {self._steps:,} steps{rate}{mean}")
             self._reported = now, step
         if step >= self._steps or now - self._written >= _WRITE_EVERY:
@@ -101,7 +101,7 @@ Backend = Callable[[Plan, Iterable[Cell], int], Generator[RunOutcome]]
 
 def usual_workers(plan: Plan) -> int:
     """How many runs go on at a time: one for each core, or one that has a GPU and all cores."""
-    return cores() if plan.device == CPU else 1
+    return cores() if plan.device == "cpu" else 1
 
 
 def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[RunOutcome]:
@@ -135,7 +135,7 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[RunOutc
     """
     import ray
 
-    task = on_cluster(work, workers, gpus=int(plan.device == CUDA))
+    task = on_cluster(work, workers, gpus=int(plan.device == "cuda"))
     known = imported_modules()
     under_way = {task.remote(plan.assigned(cell), known): cell for cell in cells}
     try:
@@ -174,7 +174,7 @@ def run_study(plan: Plan, backend: Backend = on_this_machine, workers: int | Non
         plan.begin()
         if registered:
             plan.register(registered)
-        elif plan.study.verdicts.claims and not plan.has_begun:
+        elif plan.study.verdicts.claims and not (plan.registration or plan.has_begun):
             plan.register(plan.to_register(policies(plan)))
         prepare(plan, workers)
         for cell in plan.cells:  # so that any mistake shows before the first run
@@ -203,7 +203,6 @@ def register_study(plan: Plan) -> Path:
     if plan.file is None:
         make_folder(plan.folder, _OWN)
         with exclusive(plan.folder):
-            plan.begin()
             plan.write()
             if plan.registration is None:
                 plan.register(plan.to_register(policies(plan)))

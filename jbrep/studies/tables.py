@@ -21,7 +21,7 @@ from jbrep.records.record import to_plain
 from jbrep.records.storage import exclusive, exists
 from jbrep.records.tables import read_rows, write_csv, write_rows
 from jbrep.rl import files
-from jbrep.stats import RunCurve
+from jbrep.stats.runs import RunCurve
 from jbrep.stats.scale import best_blind
 from jbrep.studies.plan import STUDY
 from jbrep.studies.record import RECORD, RunFacts, RunsRecord

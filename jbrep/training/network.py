@@ -86,11 +86,8 @@ def stacks(
         encoder = stack(sizes, architecture.code)
         decoder = stack(tuple(reversed(sizes)), architecture.output)
         if initial == "normal":
-            for name, parameter in (*encoder.named_parameters(), *decoder.named_parameters()):
-                if name.endswith("weight"):
-                    nn.init.normal_(parameter)
-                else:
-                    nn.init.zeros_(parameter)
+            for parameter in (*encoder.parameters(), *decoder.parameters()):
+                (nn.init.normal_ if parameter.ndim > 1 else nn.init.zeros_)(parameter)
     return encoder, decoder
 
 
@@ -105,9 +102,8 @@ def stack(sizes: tuple[int, ...], last: str) -> nn.Sequential:
 def layers(stack: nn.Sequential) -> tuple[Layer, ...]:
     """A stack's layers, as an encoder file holds them."""
     made = []
-    modules = [*stack, None]
-    for module, after in pairwise(modules):
+    for module, after in pairwise([*stack, None]):
         if isinstance(module, nn.Linear):
-            weight, bias = (p.detach().cpu().numpy().copy() for p in module.parameters())
+            weight, bias = (each.numpy(force=True).copy() for each in module.parameters())
             made.append(Layer(weight, bias, _NAMES.get(type(after), "linear")))
     return tuple(made)

@@ -32,9 +32,7 @@ Clip = Annotated[
 ]
 Latent = Annotated[int, Meta(ge=1, le=MAX_UNITS, description="Latent units l.")]
 Names = tuple[Annotated[str, Meta(min_length=1)], ...]
-Keep = Annotated[
-    Names, Meta(description="Features, or patterns of them, that pass around the encoder.")
-]
+Keep = Annotated[Names, Meta(description="Features, or patterns of them, that skip the encoder.")]
 Codes = Annotated[
     Literal["raw", "standard", "white"],
     Meta(

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -163,7 +164,7 @@ class Trainer:
         count = len(self._windows)
         total = torch.zeros((), device=self._windows.device)
         self.objective.train()
-        for i, batch in enumerate(self._batches(number)):
+        for i, batch in enumerate(chain.from_iterable(prefetch(self._draws(number)))):
             self.optimiser.param_groups[0]["lr"] = self._learning_rate(number, i)
             rows = min(self._batch_size, count - i * self._batch_size)
             total += self.objective.gradient(batch) * rows
@@ -190,10 +191,6 @@ class Trainer:
         step = (number - 1) * self._batches_per_epoch + batch
         progress = step / (self._batches_per_epoch * self.schedule.epochs)
         return self.schedule.learning_rate * self.objective.rate(progress, step)
-
-    def _batches(self, number: int) -> Iterator[Any]:
-        for drawn in prefetch(self._draws(number)):
-            yield from drawn
 
     def _draws(self, number: int) -> Iterator[list[Any]]:
         words = np.random.SeedSequence((self.schedule.seed, number)).generate_state(1, np.uint64)

@@ -19,8 +19,7 @@ from jbrep.dataset.formats import export, open_sources
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.envs.names import environment_versions
-from jbrep.reporting import make_report
-from jbrep.reporting.report import MARKDOWN
+from jbrep.reporting.report import MARKDOWN, make_report
 from jbrep.reporting.tables import read_tables
 from jbrep.rl import Run, Session, train
 from jbrep.rl.checkpoint import Checkpoint

@@ -79,7 +79,7 @@ def _resampled(
     if not length <= min(most, _MOST_NUMBERS / values.shape[1], MOST_RAW):
         raise InputError(
             f"an episode of {len(time):,} rows lasts {time[-1] - begin:.6g} s, {length:,.6g} rows "
-            f"at {rate:g} Hz: correct its times, end it at pauses by --gap, or give a lower --rate"
+            f"at {rate:g} Hz: correct its times, end it at pauses by `gap`, or give a lower `rate`"
         )
     count = math.ceil(length - _LATE) if has_final else int(length + _SLACK) + 1
     grid = begin + np.arange(count) / rate

@@ -103,7 +103,7 @@ def check_names(name: str, roles: Collection[str], columns: Collection[str]) -> 
     if not {*roles} & {*ENDS, "episode", "step"}:
         raise InputError(
             f"{name} doesn't say where episodes end: add terminations and truncations, or the "
-            "number of the episode in each row; for a log, give --time, --episode or --length"
+            "number of the episode in each row; for a log, give `time`, `episode` or `length`"
         )
 
 

@@ -55,17 +55,14 @@ def read(given: str) -> Frame:
             parts = {f"data/{name}": _arrays(data[name]) for name in demos}
             return _frame_of_demos(given, parts, data.attrs.get("env_args", "{}"))
         arrays = _arrays(file)
-    if not {"observation", "action"} <= own_names(given, arrays).keys():
+    own = own_names(given, arrays).keys()
+    if not {"observation", "action"} <= own:
         raise InputError(
             f"{given} has neither observations and actions, as D4RL's files do, nor data/demo_0 "
             "and so on with actions, as robomimic's"
         )
-    own = own_names(given, arrays)
-    has_ends = own.keys() & {"truncated", "next_observation", "episode", "step"}
-    ends = (
-        "no timeouts and no next observations: only terminations end episodes; --length cuts more"
-    )
-    notes = () if has_ends else (ends,)
+    ends = "no timeouts or next observations: only terminations end episodes; --length cuts more"
+    notes = () if own & {"truncated", "next_observation", "episode", "step"} else (ends,)
     label = label_of(Path(given).stem)
     return frame_of_arrays(given, arrays, label=label, about=_about(arrays), notes=notes)
 

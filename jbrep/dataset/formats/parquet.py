@@ -116,7 +116,7 @@ def _write_steps(dataset: Dataset, path: Path, name: str) -> None:
     if twice := [each for each, n in Counter(schema.names).items() if n > 1]:
         raise InputError(
             f"{dataset.folder} has a feature {twice[0]!r}, which is the name of another column of "
-            "a table: export it to npz, or name the feature otherwise, by --features"
+            "a table: export it to npz, or name the feature otherwise, by `features`"
         )
     coding = {"compression": "zstd", "use_dictionary": False, "use_byte_stream_split": True}
     with pq.ParquetWriter(path, schema, write_page_checksum=True, **coding) as writer:

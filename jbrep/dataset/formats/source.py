@@ -222,7 +222,7 @@ class Source:
         wrong = np.argwhere(~np.isfinite(values.reshape(len(values), -1)))
         for row, column in wrong[:1].tolist():
             where = f"{self._at(first + row)}: {self._roles[role][column].name!r} is empty"
-            how = "give --missing" if role in (*WIDE, "reward") else "correct it"
+            how = "give `missing`" if role in (*WIDE, "reward") else "correct it"
             raise InputError(f"{where}, or no finite number: {how}, or leave the row out")
 
     def _at(self, row: int) -> str:
@@ -260,12 +260,12 @@ def _both(frame: Frame, given: Layout) -> Layout:
     layout = frame.layout.replace(**{n: v for n, v in said.items() if v != getattr(usual, n)})
     for name in ("gap", "rate"):
         if getattr(layout, name) and not layout.time:
-            raise InputError(f"--{name} needs --time, the column of times")
+            raise InputError(f"`{name}` needs `time`, the column of times")
     if layout.fill != usual.fill and not layout.rate:
-        raise InputError(f"--fill {layout.fill} needs --rate: else nothing stands between readings")
+        raise InputError(f"`fill` {layout.fill} needs `rate`: else nothing stands between readings")
     if frame.is_sparse and not (layout.observations and layout.actions and layout.rate):
         names = ", ".join(name for name in frame.schema.names if name != layout.time)
-        needed = "give --rate, --observations and --actions, of"
+        needed = "give `rate`, `observations` and `actions`, of"
         raise InputError(f"{frame.name} has topics with clocks of their own: {needed} {names}")
     return layout
 

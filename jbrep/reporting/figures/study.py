@@ -112,21 +112,11 @@ def _agents(found: Findings) -> Iterator[tuple[Group, Any, dict[str, Any]]]:
 
 def _final(found: Findings) -> Iterator[Row]:
     """Each run's final return with the mean of all; and their spread."""
-    for group in found.groups:
-        key = {"task": group.task, "algorithm": group.algorithm}
-        for each in group.agents:
-            own = {**key, "representation": each.representation, "number": "final return"}
-            mean = _numbers("mean", each.numbers["final_return_mean"])
-            for seed, value in zip(each.seeds, each.by_run["final_return"], strict=True):
-                yield {**own, "seed": seed, "value": value, **mean}
-        for each in group.agents:
-            own = {**key, "representation": each.representation, "number": _SPREAD}
-            yield {
-                **own,
-                "seed": None,
-                "value": None,
-                **_numbers("mean", each.numbers["final_return_sd"]),
-            }
+    for _, each, key in _agents(found):
+        mean, sd = (_numbers("mean", each.numbers[f"final_return_{n}"]) for n in ("mean", "sd"))
+        for seed, value in zip(each.seeds, each.by_run["final_return"], strict=True):
+            yield {**key, "number": "final return", "seed": seed, "value": value, **mean}
+        yield {**key, "number": _SPREAD, "seed": None, "value": None, **sd}
 
 
 def _curves(found: Findings) -> Iterator[Row]:
@@ -174,12 +164,8 @@ def _profiles(found: Findings) -> Iterator[Row]:
     """Of final returns, and of scores across tasks."""
     for group, each, key in _agents(found):
         for at, share in zip(group.profile_returns, each.profile, strict=True):
-            yield {
-                **key,
-                "number": "final return",
-                "at": at,
-                **dict(zip(_ENDS, share, strict=True)),
-            }
+            of_group = {**key, "number": "final return", "at": at}
+            yield {**of_group, **dict(zip(_ENDS, share, strict=True))}
     for one in found.aggregates:
         key = {"task": f"{len(one.tasks)} tasks", "algorithm": one.algorithm}
         for at, share in zip(one.scores, one.profile, strict=True):
