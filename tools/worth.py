@@ -141,7 +141,7 @@ def returned(tables: Tables, codes: Sequence[str]) -> tuple[Array, Array, Array]
             ]
             for code in codes
         ]
-        failed = [group.failure_return]
+        failed = [np.nan if group.failure_return is None else group.failure_return]
         return np.array([[np.mean(each or failed) for each in runs] for runs in of_runs])
 
     finals = np.stack([labels[code].by_run["final_return"] for code in codes])
