@@ -171,13 +171,14 @@ def words(names: Iterable[str]) -> list[str]:
     Of letters of ASCII, digits, '.', '_' and '-', from a letter on: Greek letters are spelled,
     accents dropped. What is named as a column of every data set gets another name.
     """
-    found = dict[str, None]()
+    names = [*names]
+    found, given = dict[str, None](), {*names}
     for name in names:
         word = re.sub(r"[^A-Za-z0-9_.-]+", "_", "".join(map(_spelled, name)))[:90].strip("_")
         if not word[:1].isalpha() or _COLUMN.fullmatch(word):
             word = f"obs_{word}".rstrip("_")
         numbered = chain([word], (f"{word}_{number}" for number in count(2)))
-        found[next(each for each in numbered if each not in found)] = None
+        found[next(e for e in numbered if e not in found and (e == name or e not in given))] = None
     return [*found]
 
 

@@ -442,7 +442,7 @@ def test_nothing_in_an_npz_file_is_unpickled(tmp_path, monkeypatch):
     objects = np.array([Evil()] * 20, object)
     for name in ("rewards", "seeds", "infos"):
         d4rl("bad.npz", **{name: objects})
-        with pytest.raises(InputError, match=r"bad\.npz .*Object arrays"):
+        with pytest.raises(InputError, match=r"bad\.npz: .*Object arrays"):
             import_data("bad.npz", tmp_path / "data")
     assert [path.name for path in tmp_path.iterdir()] == ["bad.npz"]
 

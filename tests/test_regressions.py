@@ -24,7 +24,16 @@ from jbrep.collecting import collect
 from jbrep.collecting.backends import _can_be_sent
 from jbrep.collecting.policies import Heuristic, UserPolicy
 from jbrep.coordinates import make_coordinates
-from jbrep.dataset import DamageError, Dataset, Layout, ScaledDataset, from_file, from_table
+from jbrep.dataset import (
+    DamageError,
+    Dataset,
+    Layout,
+    ScaledDataset,
+    from_arrays,
+    from_file,
+    from_table,
+)
+from jbrep.dataset.formats import export
 from jbrep.dataset.manifest import find_problems, open_shard
 from jbrep.encoders import Encoder, find, save
 from jbrep.envs import Feature, Task, describe
@@ -45,6 +54,7 @@ from jbrep.rl.normalization import Statistics
 from jbrep.rl.overrides import overridden
 from jbrep.stats.intervals import Bounds, surely_above
 from jbrep.studies.config import Study, as_study
+from jbrep.text import words
 from jbrep.training.objective import feature_weights
 
 STUDY = {"tasks": ["Pendulum-v1"], "algorithms": ["sac"], "representations": ["full"], "seeds": [0]}
@@ -567,3 +577,32 @@ def test_a_warning_of_the_robot_s_does_not_hide_its_symmetry(monkeypatch):
 
     monkeypatch.setattr(JitterbugEnv, "step", warned)
     assert _by_turning(describe("face_direction"))[1]
+
+
+def test_a_log_s_roles_names_and_order_are_what_they_say(tmp_path):
+    table = {"t": np.arange(4.0), "pos": np.ones(4), "cmd": np.ones(4)}
+    both = Layout(observations=("*s", "cmd"), actions=("cmd",), time="t")
+    assert "cmd in the observation" in refused(from_table, tmp_path / "no", table, both)
+    assert words(["a_x", "a x", "a_x_2"]) == ["a_x", "a_x_3", "a_x_2"]
+    task = describe("Regressions/Rail-v0")
+    others = [{"name": name} for name in reversed(task.feature_names)]
+    assert "another place" in refused(with_features, task, {"features": others})
+    names = [{"name": f"q_{each}", "kind": "quaternion", "group": "q"} for each in "xyzw"]
+    four = Task(
+        **{"id": "Q-v0", "name": "Q-v0", "features": tuple(map(Feature, "abcd"))},
+        **{"action_low": (-1,), "action_high": (1,), "max_episode_steps": 9},
+    )
+    assert "w, x, y, z" in refused(with_features, four, {"features": names})
+
+
+def test_episodes_of_another_export_are_refused_and_masks_are_gaps(tmp_path):
+    for name, rows in (("a", 4), ("b", 5)):
+        ends = np.arange(rows) == rows - 1
+        given = np.ones((rows, 2)), np.ones((rows, 1)), ends * 1.0, ends
+        data = from_arrays(tmp_path / name, *given)
+        export(data, "parquet", tmp_path / f"{name}.parquet")
+    (tmp_path / "b-episodes.parquet").replace(tmp_path / "a-episodes.parquet")
+    assert "of one export" in refused(from_file, tmp_path / "c", tmp_path / "a.parquet")
+    masked = np.ma.masked_greater(np.arange(8.0).reshape(4, 2), 3)
+    told = refused(from_arrays, tmp_path / "d", masked, np.ones((4, 1)), np.ones(4), np.ones(4))
+    assert "row 2" in told or "obs_0" in told

@@ -147,7 +147,7 @@ def _wraps(seen: Transitions, i: int, turn: Turn) -> Finding:
             "bounded = true; then --encoder coordinates"
         )
     elif (low, turn.size) in TURNS:
-        fix = f"in degrees: {_in_radians(feature.name)}; then it is an angle for features.toml"
+        fix = f"in degrees: {_in_radians(feature.name)}"
     else:
         fix = "give its cosine and sine in the environment"
     return Finding("wraps", (feature.name,), why, fix, turn._asdict())
@@ -164,7 +164,8 @@ def _winds(seen: Transitions, i: int) -> Finding | None:
 
 
 def _in_radians(name: str) -> str:
-    return f"give np.radians({name}) in the environment, or import with --units {name}=deg"
+    by_import = f"--angles {name} --units {name}=deg"
+    return f"give np.radians({name}) in the environment, or import with {by_import}"
 
 
 def _flips(before: Array, after: Array) -> Iterator[tuple[int, int]]:

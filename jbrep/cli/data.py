@@ -78,8 +78,10 @@ def _report(out: Path, write: Callable[[], object]) -> None:
 
 
 def _report_size(out: Path, manifest: Any) -> None:
-    what = f"{counted(manifest.episodes, 'episode')} of {manifest.task.name}"
-    say(f"{what}, {manifest.rows:,} rows, {manifest.bytes / 1e6:,.1f} MB in {out}")
+    task, every = manifest.task, manifest.task.timestep
+    what = f"{counted(manifest.episodes, 'episode')} of {task.name}, {manifest.rows:,} rows"
+    step = "" if every is None else f", {every:.4g} s apart"
+    say(f"{what}{step}, {manifest.bytes / 1e6:,.1f} MB in {out}")
 
 
 @command("data info data/face")

@@ -158,7 +158,8 @@ def options_of(source: Any) -> dict[str, Option]:
             made = options_of(maker)
             main = made.pop(name)
             is_argument = each.kind is _Parameter.POSITIONAL_ONLY
-            default = main.key.default if default is NODEFAULT else default
+            usual = NODEFAULT if main.key.default is None else main.key.default
+            default = usual if default is NODEFAULT else default
             key = main.key._replace(default=default)
             own[name] = main._replace(key=key, is_argument=is_argument)
             continue

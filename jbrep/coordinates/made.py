@@ -51,8 +51,8 @@ def make_coordinates(
         raise InputError(f"{system} of {task.name} leaves nothing: use coordinates")
     if made.names == task.feature_names:
         raise InputError(
-            f"{system} of {task.name} would be the observation: declare kinds of its features, "
-            "with `features` FILE.toml"
+            f"{system} of {task.name} would be the observation: declare kinds of its features in "
+            "a file of --features, of a log's data when it is imported"
         )
     return made
 

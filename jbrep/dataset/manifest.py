@@ -131,7 +131,8 @@ def read_manifest(folder: Path) -> Manifest:
     path = folder / MANIFEST
     if not exists(path):
         raise InputError(
-            f"no data set in {folder}: expected a folder that jbrep collect wrote, with {MANIFEST}"
+            f"no data set in {folder}: expected a folder with {MANIFEST}, as jbrep collect and "
+            "jbrep data import write it"
         )
     with refusing(f"can't read {path}", (OSError,)):
         raw = path.read_bytes()

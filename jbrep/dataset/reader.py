@@ -272,6 +272,8 @@ class Dataset:
             "made with": ", ".join(f"{name} {what}" for name, what in about["versions"].items()),
             "fingerprint": about["fingerprint"],
         }
+        if self.task.timestep is not None:
+            named["time step"] = f"{self.task.timestep:.4g} s"
         if names := self.task.action_names:
             named["actions"] = ", ".join(names)
         if code := self.manifest.settings.reward:

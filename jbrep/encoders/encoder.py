@@ -150,7 +150,9 @@ class Encoder(BaseEncoder):
         return _imported(known, name, "torch", *of_modules(encoder, known.size, decoder))
 
     @staticmethod
-    def from_onnx(path: Path, task: Task, decoder: Path | None, name: str) -> "Encoder":
+    def from_onnx(
+        path: Path, task: Task | str, decoder: Path | None = None, name: str = "own"
+    ) -> "Encoder":
         """An encoder from ONNX models.
 
         A model has one input, (n, d) in physical units, and one output; or the outputs `latent` and
@@ -164,8 +166,10 @@ class Encoder(BaseEncoder):
             name: what tables will call it: lower-case letters, digits and hyphens.
         """
         from jbrep.encoders.imported import of_files  # imports onnx
+        from jbrep.envs.description import as_task  # imports Gymnasium
 
-        return _imported(task, name, "onnx", *of_files(path, task.size, decoder))
+        known = as_task(task)
+        return _imported(known, name, "onnx", *of_files(path, known.size, decoder))
 
     def with_header(self, **changes: Any) -> "Encoder":
         """The same encoder with other values of some fields in its header."""
@@ -262,9 +266,9 @@ def pack(encoder: Encoder) -> bytes:
     return container.pack(encoder.tensors(), encoder.header.as_json())
 
 
-def save(encoder: Encoder, path: Path) -> None:
+def save(encoder: Encoder, path: Path | str) -> None:
     """Write an encoder's file, whole or not at all."""
-    write_whole(path, pack(encoder))
+    write_whole(Path(path), pack(encoder))
 
 
 def load(path: Path) -> Encoder:

@@ -161,6 +161,13 @@ def with_features(task: Task, said: Path | str | Mapping[str, Any]) -> Task:
         rows = changes.features
         if rows is not None and len(rows) != task.size:
             raise InputError(f"it must have a [[features]] for each of the {task.size} features")
+        names = [row.name or own for row, own in zip(rows or (), task.feature_names, strict=False)]
+        moved = [n for n, own in zip(names, task.feature_names, strict=False) if n != own]
+        if len({*names}) == len(names) and (others := {*moved} & {*task.feature_names}):
+            raise InputError(f"{min(others)} is in another place: keep the order of the features")
+        turned = [n for n, row in zip(names, rows or (), strict=False) if row.kind == "quaternion"]
+        if "".join(each[-1] for each in turned[:4]).lower() == "xyzw":
+            raise InputError(f"a quaternion is w, x, y, z: {turned[0]} comes first; reorder them")
         features, offsets = list(task.features), {}
         for i, row in enumerate(rows or ()):
             own = _said(row)

@@ -287,7 +287,7 @@ class Task(Record, frozen=True):
         if self.timestep is None:
             raise InputError(
                 f"the time step of {self.name} is not known: give it as timestep in a file of "
-                "`features`"
+                "--features, of data when they are imported or collected"
             )
         return self.timestep
 

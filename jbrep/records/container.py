@@ -54,7 +54,9 @@ def unpack(raw: bytes, path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
     """What `pack` made bytes of, as `read` returns it; the path is for messages."""
     try:
         tensors, header = safetensors.numpy.load(raw), _header(raw)
-    except _MALFORMED as error:
+    except _MALFORMED:
+        if path.suffix == ".onnx":
+            error = "it is an ONNX model: jbrep encoder import makes an encoder of one"
         raise InputError(f"{path} is not a jbrep {what}, or is truncated: {error}") from None
     if header.pop(_CHECKSUM, None) != checksum(tensors, header):
         raise DamageError(

@@ -129,7 +129,7 @@ def first_rows(data: ScaledDataset, rows: NDArray[np.int64], horizon: int) -> ND
         part = "held-out" if len(rows) and rows[0] in data.test else "training"
         raise InputError(
             f"no {part} episode of {data.dataset.folder} has more than {counted(horizon, 'step')}: "
-            "look fewer steps ahead"
+            "look fewer steps ahead, or predict a shorter chunk of actions"
         )
     return starts
 

@@ -99,7 +99,9 @@ def frame_in_python(columns: Mapping[str, Any], once: Mapping[str, Any], name: s
     observations, more = given["observation"], dict[str, Any](label=label_of(name))
     if isinstance(single, list | tuple) and len(single) and np.ndim(single[0]) == 1:
         check_lengths(name, given, "episodes")
-        several = {what: [*map(np.asarray, values)] for what, values in given.items()}
+        several = {
+            what: [array_of(name, what, each) for each in values] for what, values in given.items()
+        }
         parts = [{w: values[i] for w, values in several.items()} for i in range(len(observations))]
         given, more["place"] = joined(name, {f"episode {i}": e for i, e in enumerate(parts)})
         observations = observations[0]
@@ -150,8 +152,11 @@ def _with_next(arrays: Mapping[str, Array]) -> Mapping[str, Array]:
 
 def array_of(name: str, what: str, values: ArrayLike) -> Array:
     """An array with rows."""
-    with refusing(f"{name} has {what}s of different sizes", (ValueError,)):
-        array = np.asarray(values)
+    with (
+        refusing(f"{name} has {what}s that make no array", (RuntimeError, TypeError)),
+        refusing(f"{name} has {what}s of different sizes", (ValueError,)),
+    ):
+        array = np.asarray(np.ma.filled(values, np.nan) if np.ma.isMaskedArray(values) else values)
     if not array.ndim:
         raise InputError(f"{name} has a single {what}: it must be an array")
     return array

@@ -8,6 +8,7 @@ import numpy as np
 from jbrep.dataset.formats.arrays import frame_of_steps
 from jbrep.dataset.formats.frame import About, Frame, label_of
 from jbrep.dataset.reader import Dataset
+from jbrep.errors import first_line, refusing
 from jbrep.records.storage import publish, unfinished
 
 _EPISODES = "episodes/"  # of columns with a row for each episode, as jbrep writes them
@@ -26,7 +27,10 @@ def read(given: str) -> Frame:
     """Read all arrays; objects, which would have to be unpickled, are refused."""
     path = Path(given)
     with np.load(path, allow_pickle=False) as archive:
-        arrays = {name: np.asarray(archive[name]) for name in archive.files}
+        arrays = dict[str, Any]()
+        for name in archive.files:
+            with refusing(f"{given}: {name!r} can't be read", describe=first_line):
+                arrays[name] = np.asarray(archive[name])
         names, units, offsets = (
             tuple(kind(each) for each in arrays.pop(name, np.array(())).ravel())
             for name, kind in _ABOUT.items()

@@ -74,6 +74,13 @@ def _exported(path: Path, schema: pa.Schema, settings: bytes) -> dict[str, Any]:
         final = np.stack(episodes["final_observation"].to_numpy()).astype(np.float64)
         once = {name: episodes[name].to_numpy() for name in frame.ENDS}
         once["seed"] = np.array(episodes["seed"].to_pylist(), np.int64)
+        lengths = episodes["length"].to_numpy()
+    with opened(path) as file:
+        counts = np.bincount(file.read(["episode"])["episode"].to_numpy())
+    if not np.array_equal(counts, lengths):
+        raise InputError(
+            f"{beside} has episodes of other lengths than {path}: both must be of one export"
+        )
     offsets = zip(task.features, task.offset.tolist(), strict=True)
     return {
         "task": task,

@@ -15,7 +15,7 @@ from jbrep.dataset.formats.frame import ALIASES, About, Frame, check_names, own_
 from jbrep.dataset.layout import Layout
 from jbrep.envs.names import is_code
 from jbrep.envs.task import MAX_FEATURES, Feature
-from jbrep.errors import InputError, matching
+from jbrep.errors import InputError, listed, matching
 from jbrep.text import words
 
 WIDE = ("observation", "action", "next_observation")  # with many numbers a row
@@ -24,7 +24,8 @@ RADIANS = ("", "rad")
 MOST_RADIANS = 2 * math.pi + 0.01  # of an angle whose unit nobody says
 _TURNS = (2 * math.pi, 360.0)
 _IN_DEGREES = re.compile(r"[_. ]?deg(rees?)?$", re.IGNORECASE)
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}  # by unit
+_MICRO = dict.fromkeys(("us", "\u00b5s", "\u03bcs"), 1e-6)  # the letter mu, too
+SECONDS = {"s": 1.0, "ms": 1e-3, **_MICRO, "ns": 1e-9, "min": 60.0}  # by unit
 _ACTION = re.compile(r"actions?(_\d+)?")
 _NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
 
@@ -80,6 +81,7 @@ def roles_of(frame: Frame, layout: Layout) -> Roles:
     if layout.observations:
         roles["next_observation"] = _after(frame, leaves, observed)
     roles = {role: some for role, some in roles.items() if some}
+    _check_apart(name, roles)
     check_names(name, [*roles, *(["step"] if layout.time or layout.length else [])], names)
     for role, some in roles.items():
         if len(some) > (MAX_FEATURES if role in WIDE else 1):
@@ -88,7 +90,7 @@ def roles_of(frame: Frame, layout: Layout) -> Roles:
         if not pa.types.is_floating(each.kind):
             raise InputError(
                 f"{name} has {each.kind} in the column {each.column!r}: actions must be "
-                "continuous; if it is, name the actions"
+                "continuous; if it is, name the actions, or give them as floats"
             )
     return roles
 
@@ -220,6 +222,16 @@ class Turns:
         return turns.tolist()
 
 
+def _check_apart(name: str, roles: Roles) -> None:
+    """Refuse actions in the observation, from which they would be read when a policy is cloned."""
+    acted = {(each.column, each.place) for each in roles.get("action", ())}
+    if both := [e.name for e in roles["observation"] if (e.column, e.place) in acted]:
+        raise InputError(
+            f"{name} has {listed(both)} in the observation and in the action, which it can't show "
+            "before it is chosen: name the observations without it"
+        )
+
+
 def second_of(name: str, time: Leaf) -> float:
     """What brings times to seconds; name is the frame's."""
     is_stamp = pa.types.is_timestamp(time.kind) or pa.types.is_duration(time.kind)
@@ -227,7 +239,7 @@ def second_of(name: str, time: Leaf) -> float:
     if not (is_stamp or is_number or pa.types.is_decimal(time.kind)):
         raise InputError(
             f"{name} has {time.kind} in the column {time.column!r}: times must be numbers, "
-            "timestamps or durations"
+            "durations, or timestamps such as 2026-03-14 11:59:58.010"
         )
     unit = "ns" if is_stamp else time.unit or "s"
     if unit not in SECONDS:
