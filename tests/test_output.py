@@ -38,7 +38,7 @@ ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "mo
 def test_any_names_become_different_words():
     given = ["t", "θ", "ώ", "é", "q[0]", "q[1]", "_x", "0", "a b", "a_b", "", "step", "action_1"]
     assert words(given) == [
-        *("t", "theta", "omega", "e", "q_0", "q_1", "x", "obs_0", "a_b", "a_b_2"),
+        *("t", "theta", "omega", "e", "q_0", "q_1", "x", "obs_0", "a_b_2", "a_b"),
         *("obs", "obs_step", "obs_action_1"),
     ]
 

@@ -101,11 +101,16 @@ class Recording:
             write_whole(path, self._memory.drain_as_bytes())
 
 
+def _is_recording(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
 def check_out(path: Path) -> None:
     """Make sure that a recording can be there, and only an earlier one would be overwritten."""
     if not exists(path):
         if path.suffix != SUFFIX:
             name = path.with_suffix(SUFFIX)
             raise InputError(f"a recording is a file such as {name}, not {path}")
-    elif not path.is_file() or path.open("rb").read(len(_MAGIC)) != _MAGIC:
+    elif not path.is_file() or not _is_recording(path):
         raise InputError(f"{path} exists and is not a Rerun recording: choose another `out`")

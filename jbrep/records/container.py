@@ -54,10 +54,10 @@ def unpack(raw: bytes, path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
     """What `pack` made bytes of, as `read` returns it; the path is for messages."""
     try:
         tensors, header = safetensors.numpy.load(raw), _header(raw)
-    except _MALFORMED:
-        if path.suffix == ".onnx":
-            error = "it is an ONNX model: jbrep encoder import makes an encoder of one"
-        raise InputError(f"{path} is not a jbrep {what}, or is truncated: {error}") from None
+    except _MALFORMED as error:
+        is_onnx = path.suffix == ".onnx"
+        why = "jbrep encoder import makes an encoder of an ONNX model" if is_onnx else error
+        raise InputError(f"{path} is not a jbrep {what}, or is truncated: {why}") from None
     if header.pop(_CHECKSUM, None) != checksum(tensors, header):
         raise DamageError(
             f"{path} is damaged (its checksum doesn't match): delete it to start over"
