@@ -342,7 +342,7 @@ def _project_modules() -> list[str]:
 
 
 def parse_pairs(given: Iterable[str], option: str = "--env") -> dict[str, Any]:
-    """Arguments from an option's NAME=VALUE; a value is JSON, or else text."""
+    """Arguments from an option's NAME=VALUE; values are JSON, True, False, None, or text."""
     arguments: dict[str, Any] = {}
     for pair in given:
         name, equals, value = pair.partition("=")
@@ -351,7 +351,7 @@ def parse_pairs(given: Iterable[str], option: str = "--env") -> dict[str, Any]:
         try:
             arguments[name] = json.loads(with_zeros(value))
         except (ValueError, RecursionError):
-            arguments[name] = value
+            arguments[name] = {"True": True, "False": False, "None": None}.get(value, value)
     return arguments
 
 
