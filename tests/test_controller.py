@@ -118,7 +118,7 @@ def test_what_is_refused_changes_nothing(history):
         ([0.3], "takes 2 numbers"),
         ([0.3] * (2 * history + 2), "takes 2 numbers"),  # of which it would take the first two
         (0.3, "takes 2 numbers"),
-        ([0.1, np.nan], "obs_2 is missing or not finite"),
+        ([0.1, np.nan], "obs_2 is missing or not finite: .* for 0 steps in a row"),
     ]
     several = [[0.1, 0.2]] * 3
     for step in range(4):

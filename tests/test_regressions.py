@@ -605,4 +605,4 @@ def test_episodes_of_another_export_are_refused_and_masks_are_gaps(tmp_path):
     assert "of one export" in refused(from_file, tmp_path / "c", tmp_path / "a.parquet")
     masked = np.ma.masked_greater(np.arange(8.0).reshape(4, 2), 3)
     told = refused(from_arrays, tmp_path / "d", masked, np.ones((4, 1)), np.ones(4), np.ones(4))
-    assert "row 2" in told or "obs_0" in told
+    assert "row 2: 'observation.obs_0'" in told

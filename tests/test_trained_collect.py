@@ -123,6 +123,7 @@ def test_a_data_set_keeps_the_policy_of_a_run_that_goes_on_or_is_gone(runs, tmp_
         told = jbrep(*command, "--steps", 200)
         assert told.exit_code == 0, told.output
         assert f"{out / POLICY} keeps the policy of" in told.stderr
+        assert "at step 40" in told.stderr
     assert (out / POLICY).read_bytes() == kept
     gather(runs / "under_way", tmp_path / "once", steps=200, seed=0, store_state=False)
     for name, column in Dataset(out).episodes.items():
