@@ -411,7 +411,7 @@ def train(
 
     if one_robot := is_one_robot(known, threads):
         preset, settings = preset or MODERN, {**settings, "one_robot": True}
-    overrides = {**overrides, "normalize": True} if normalize else overrides
+    overrides = {**overrides, "normalize": normalize} if normalize is not False else overrides
     settings |= {"encoder": encoder, "seed": seed, "begin_from": begin_from}
     run = Run.of(known, algorithm, preset, overrides, **settings)
     if one_robot and run.learner.hyperparameters.num_envs > 1:

@@ -283,7 +283,7 @@ def test_help_of_a_kind_has_its_settings_alone():
     told = jbrep("train-encoder", "--kind", "slow", "--help").output
     assert "--lags" in told
     assert "--noise" not in told
-    assert jbrep("train-dae", "--kind", "pca", "--help").exit_code == 0
+    assert jbrep("train-dae", "--kind", "pca", "--help").exit_code == 2
 
 
 class Walk(Record, frozen=True, kw_only=True):

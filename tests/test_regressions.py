@@ -1,6 +1,7 @@
 """Regressions: what once failed is refused in a line, or works."""
 
 import json
+import pickle
 import subprocess
 import sys
 import time
@@ -54,6 +55,7 @@ from jbrep.rl.normalization import Statistics
 from jbrep.rl.overrides import overridden
 from jbrep.stats.intervals import Bounds, surely_above
 from jbrep.studies.config import Study, as_study
+from jbrep.studies.plan import Plan
 from jbrep.text import words
 from jbrep.training.objective import feature_weights
 
@@ -474,6 +476,7 @@ def test_encoders_of_other_features_or_weights_are_others(tmp_path):
     encoder = Fitter(plain, tmp_path / "out").fit("pca", latent=1).encoder
     assert "features" in refused(Fitter(angle, tmp_path / "out").fit, "pca", latent=1)
     assert "4,096" in refused(Fitter(plain, tmp_path).plan, "ofe", latent=2500)
+    assert "name" in refused(Fitter(plain, tmp_path).plan, "pca", latent=1, name="full")
     for weights in ({"x": 5, "*": 1}, {"*": 1, "x": 5}):
         assert feature_weights(plain, weights).tolist() == [5, 1]
     out = tmp_path / "text"
@@ -606,3 +609,17 @@ def test_episodes_of_another_export_are_refused_and_masks_are_gaps(tmp_path):
     masked = np.ma.masked_greater(np.arange(8.0).reshape(4, 2), 3)
     told = refused(from_arrays, tmp_path / "d", masked, np.ones((4, 1)), np.ones(4), np.ones(4))
     assert "row 2: 'observation.obs_0'" in told
+
+
+def test_the_processes_of_a_study_register_what_this_one_did(monkeypatch):
+    plan = Plan(as_study(STUDY | {"tasks": ["Regressions/Rail-v0"]}), "none")
+    sent = pickle.loads(pickle.dumps(plan.known))
+    monkeypatch.delitem(gymnasium.registry, "Regressions/Rail-v0")
+    sent.take()
+    assert gymnasium.spec("Regressions/Rail-v0").entry_point is Rail
+
+
+def test_settings_that_no_run_can_have(tmp_path):
+    set_to = {"action_repeat": 5, "buffer_size": 1e5}
+    assert "an episode" in refused(api.train, "Regressions/Rail-v0", tmp_path, overrides=set_to)
+    assert "normalize" in refused(api.train, "face_direction", tmp_path, normalize="no")

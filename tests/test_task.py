@@ -14,7 +14,7 @@ from jbrep import api
 from jbrep.cli.generator import parse_pairs
 from jbrep.dataset.schema import episode_seed
 from jbrep.envs import Environments, Feature, Task, describe
-from jbrep.envs.names import import_modules, imported_modules, name_given, spec_of
+from jbrep.envs.names import Known, import_modules, name_given, spec_of
 from jbrep.envs.recording import outcome
 from jbrep.envs.task import check_same
 from jbrep.errors import InputError
@@ -214,10 +214,10 @@ def test_modules_are_imported_for_a_command_line_only(tmp_path, monkeypatch):
     (tmp_path / "sledges_too.py").write_text("import environments")
     (tmp_path / "broken_package.py").write_text("1 / 0")
     assert name_given(SLEDGE) == SLEDGE
-    assert imported_modules() == ()
+    assert Known.of([]).modules == ()
     assert name_given(f"sledges_too:{SLEDGE}") == SLEDGE
     import_modules(["sledges_too"])
-    assert imported_modules() == ("sledges_too",)
+    assert Known.of([]).modules == ("sledges_too",)
     for module, reason in (("none", "No module named 'none'"), ("broken_package", "division by")):
         with pytest.raises(InputError, match=f"can't import {module}: .*{reason}"):
             name_given(f"{module}:Some-v0")
@@ -328,7 +328,7 @@ def test_a_class_or_an_instance_is_a_task(monkeypatch, tmp_path):
     monkeypatch.setattr("jbrep.envs.names._imported", [])
     told = describe(environments.Sledge, episode_steps=30)
     assert told.id == "environments/Sledge"
-    assert imported_modules() == ("environments",)  # for the processes that collect
+    assert Known.of([]).modules == ("environments",)  # for the processes that collect
     monkeypatch.delitem(gymnasium.registry, told.id)
     assert describe("environments/Sledge", episode_steps=30) == told
     monkeypatch.delitem(gymnasium.registry, told.id)

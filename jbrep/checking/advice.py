@@ -58,14 +58,15 @@ def advise(
         where or kinds[0] != kinds[1] or _declared(task.whole) != _declared(baseline) or scales
     )
     known = task.whole.replace(features=features) if use_file else task.whole
+    steps = [each.numbers["history"] for each in findings if "history" in each.numbers]
+    history = max([*steps, task.view.history if task.view else 1])
+    is_symmetric = is_symmetric and history == 1  # with more there is no "symmetry"
     hidden = [*(task.view.hidden if task.view else ())]
     for each in findings:
         is_copied = each.kind == "copy" and not {*hidden}.isdisjoint(each.features)
         if is_copied or (each.kind == "world" and not is_symmetric):
             known_names = {*task.whole.feature_names}.difference(hidden)
             hidden += [name for name in each.features if name in known_names]
-    steps = [each.numbers["history"] for each in findings if "history" in each.numbers]
-    history = max([*steps, task.view.history if task.view else 1])
     system, why = ("symmetry", "turning and shifting it was tried: nothing else changes")
     if not is_symmetric:
         winds = any(each.kind == "winds" for each in findings)
@@ -78,8 +79,9 @@ def advise(
         if use_file and not where:
             commands.insert(0, ["check", *_given(task, default)[1:], "--write", "features.toml"])
     else:
-        derived = f"{data}-seen" if view else str(data)
-        commands = [["data", "derive", str(data), *view, "--out", derived]] if view else []
+        derive = view and not task.view  # what is derived can't be derived from again
+        derived = f"{data}-seen" if derive else str(data)
+        commands = [["data", "derive", str(data), *view, "--out", derived]] if derive else []
         commands += [["train-encoder", "--kind", system, "--data", derived, "--out", "encoders"]]
     command = "\n".join(shlex.join(["jbrep", *each]) for each in commands)
     return Advice(system, why, command, features)

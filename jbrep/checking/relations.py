@@ -26,6 +26,7 @@ _GAIN, _SURE_GAIN = 0.1, 0.03  # of R^2 by a history: the least, and between the
 _LEFT = 0.6  # of the error: what a history leaves, at most
 _OF_ACTIONS = 0.7  # of that gain by past actions alone, where they explain it
 _HARDLY, _MOSTLY, _KNOWN, _SPARE = 0.1, 0.5, 0.8, 0.02  # R^2: bounds of such words; a margin
+_RIDGE = 1e-3  # little, as features less what they were before are small
 _LOSS = 0.01  # of R^2, that what is left out may cost
 _DEPENDS = 0.003, 2.0  # error by a shuffled feature: share of variation, times the error before
 _SLOW, _ENDS = 0.2, 0.2  # change of a place by its deviation; share of ends at extreme values
@@ -116,7 +117,7 @@ class Relations:
         from sklearn.preprocessing import StandardScaler
 
         rows = [(given[self._train], wanted[self._train]) for given, wanted in problems]
-        models = [make_pipeline(StandardScaler(), Ridge()).fit(x, y) for x, y in rows]
+        models = [make_pipeline(StandardScaler(), Ridge(_RIDGE)).fit(x, y) for x, y in rows]
         ridges = [lambda x, m=each: m.predict(x).reshape(len(x), -1) for each in models]
         residuals = [y - ridge(x) for (x, y), ridge in zip(rows, ridges, strict=True)]
         parts = [np.hsplit(each, [-1]) if each.shape[1] > 1 else [each] for each in residuals]

@@ -37,7 +37,8 @@ class _Making(Command):
         return super().parse_args(ctx, args)
 
     def options(self) -> list[click.Parameter]:
-        own = [each for each in super().options() if each.name != "latent"]
+        left_out = {"latent", "kind"} if len(self.kinds) == 1 else {"latent"}
+        own = [each for each in super().options() if each.name not in left_out]
         return [*own, *self._settings]
 
     @cached_property

@@ -10,13 +10,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import gymnasium
-from gymnasium.envs.registration import EnvSpec
-
 from jbrep.collecting.shards import Growth, Produce, Simulator
 from jbrep.dataset.schema import Columns
 from jbrep.envs.make import close_kept, is_batched
-from jbrep.envs.names import import_modules, imported_modules, spec_of
+from jbrep.envs.names import Known
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, first_line, refusing
 from jbrep.machine import cores
@@ -32,11 +29,10 @@ def local(simulator: Simulator) -> Produce:
     """A batch's episodes in turn on threads; other environments' side by side in processes."""
     workers = simulator.num_threads or cores()
     task = simulator.settings.task
-    # those of dm_control can't be sent, and are registered wherever they are asked for
-    spec = None if task.id.startswith("dm_control/") else spec_of(task)
-    if is_batched(task) or workers == 1 or not _can_be_sent(spec, simulator):
+    known = Known.of([task])
+    if is_batched(task) or workers == 1 or not _can_be_sent(known, simulator):
         return simulator.in_turn
-    return _in_processes(replace(simulator, num_envs=1, num_threads=1), workers, spec)
+    return _in_processes(replace(simulator, num_envs=1, num_threads=1), workers, known)
 
 
 def _can_be_sent(*parts: Any) -> bool:
@@ -50,7 +46,7 @@ def _can_be_sent(*parts: Any) -> bool:
         return False
 
 
-def _in_processes(simulator: Simulator, workers: int, spec: EnvSpec | None) -> Produce:
+def _in_processes(simulator: Simulator, workers: int, known: Known) -> Produce:
     """Pieces made side by side, given in order; one whose worker is killed is made again."""
 
     def produce(growth: Growth, tick: Tick) -> Iterator[Columns]:
@@ -59,7 +55,6 @@ def _in_processes(simulator: Simulator, workers: int, spec: EnvSpec | None) -> P
             yield from simulator.in_turn(growth, tick)
             return
         begin, waiting, made = growth.episodes, deque[range](), dict[range, Made]()
-        known = imported_modules(), spec
         close_kept()  # the workers have their own
 
         def next_piece() -> range | None:
@@ -90,16 +85,11 @@ def _in_processes(simulator: Simulator, workers: int, spec: EnvSpec | None) -> P
     return produce
 
 
-def make_episodes(
-    known: tuple[tuple[str, ...], EnvSpec | None], simulator: Simulator, episodes: range
-) -> Made:
+def make_episodes(known: Known, simulator: Simulator, episodes: range) -> Made:
     """Make some episodes of one shard, in a process of its own."""
-    modules, spec = known  # to import, and what the environment is, if none of them registers it
     made: Made = []
     try:
-        import_modules(modules)
-        if spec:
-            gymnasium.registry.setdefault(spec.id, spec)
+        known.take()
         for block in simulator.made(episodes, _stop_on_request):
             made.append(block)
     except InputError as error:

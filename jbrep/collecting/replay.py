@@ -50,8 +50,7 @@ def replay_problems(
 def why_not_again(settings: DataSettings) -> str:
     """Why no episode of a data set can be simulated again; empty if it can be."""
     if settings.is_imported:
-        source = settings.policy["source"]
-        return f"they were imported; import their source, {source}, again in another folder"
+        return f"they were imported from {settings.policy['source']}, so their seeds are unknown"
     if not settings.task.reproducible:
         return f"{settings.task.name} is not reproducible; collect again in another folder"
     return ""

@@ -17,7 +17,7 @@ from itertools import count
 from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -99,9 +99,24 @@ def import_modules(modules: Iterable[str]) -> None:
             _imported.append(module)
 
 
-def imported_modules() -> tuple[str, ...]:
-    """The modules imported so far, for other processes to import, too."""
-    return tuple(_imported)
+class Known(NamedTuple):
+    """What another process imports and registers, to make the same environments."""
+
+    modules: tuple[str, ...]
+    specs: tuple[EnvSpec, ...]  # which also what isn't imported by `import_modules` registered
+
+    @classmethod
+    def of(cls, tasks: Iterable[Task]) -> "Known":
+        """What this process knows of tasks."""
+        # those of dm_control can't be sent, and are registered wherever they are asked for
+        own = [task for task in tasks if not task.id.startswith("dm_control/")]
+        return cls(tuple(_imported), tuple(map(spec_of, own)))
+
+    def take(self) -> None:
+        """Import and register it in this process."""
+        import_modules(self.modules)
+        for spec in self.specs:
+            gymnasium.registry.setdefault(spec.id, spec)
 
 
 def imported(module: str) -> ModuleType | None:

@@ -18,6 +18,7 @@ from jbrep.encoders import Encoder, load, save
 from jbrep.encoders.encoder import SUFFIX
 from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader, check_name
 from jbrep.encoders.layers import dense, run
+from jbrep.encoders.shipped import UNLEARNED
 from jbrep.envs.task import Array
 from jbrep.errors import InputError, differences
 from jbrep.methods.linear import DEVIATION, NEGLIGIBLE, held_out_error
@@ -110,6 +111,8 @@ class Fitter:
         method = method.resolved(data)
         name = name or name_of(method)
         check_name(name)
+        if name in UNLEARNED and name != method.name:
+            raise InputError(f"`name` is {name}, as an encoder that needs no data is called")
         method.check_data(data)
         if isinstance(method, Learned):
             windows = count_windows(data, method.objective(data).horizon)

@@ -300,6 +300,8 @@ def export(controller: Controller, path: Path) -> None:
             f"the encoder {controller.encoder.name} is code, which a model can't hold: give the "
             "run an encoder's file, as Encoder.from_torch makes it"
         )
+    if path.suffix != ".onnx":
+        raise InputError(f"{path} must end in .onnx, by which a policy's model is known")
     if exists(path):  # known before the work
         raise taken(path)
     write_new(path, _onnx(controller))

@@ -108,6 +108,8 @@ def _overridden(algorithm: str, preset: str, text: str) -> Hyperparameters:
     result = get_preset(preset, algorithm)
     for name, value in json.loads(text).items():
         _check_name(algorithm, name)
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)  # 1e5
         result = _changed(result, algorithm, name, value)
     _check_together(algorithm, result)
     _build(algorithm, result)

@@ -15,6 +15,7 @@ from jbrep.envs.description import as_task
 from jbrep.envs.environments import envs_at_once
 from jbrep.envs.names import is_code
 from jbrep.envs.task import Task
+from jbrep.errors import InputError
 from jbrep.records.record import Sha256, to_plain
 from jbrep.rl.agent import evaluate, make_agent, make_env
 from jbrep.rl.learner import Learner
@@ -71,6 +72,9 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
 
     def settings(self, encoder: BaseEncoder) -> RunSettings:
         """All settings that two equal runs share, given what `find_encoder` returns."""
+        repeat, most = self.learner.hyperparameters.action_repeat, self.task.max_episode_steps
+        if repeat > most:
+            raise InputError(f"action_repeat is {repeat}: an episode has {most} steps alone")
         is_kept_as_code = is_code(self.encoder) and not isinstance(encoder, Encoder)
         shared = to_plain(self.training_settings) | {
             "device": get_device(self.device).type,

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
-from jbrep.envs.names import environment_versions, file_digest
+from jbrep.envs.names import Known, environment_versions, file_digest
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.play.sources import frozen_file
 from jbrep.records.commit import CHANGES, commits, in_work_tree, is_committed
@@ -246,6 +246,11 @@ class Plan:
     def device(self) -> str:
         """What gradient steps are taken on."""
         return str(get_device(self.study.device).type)
+
+    @property
+    def known(self) -> Known:
+        """What the processes of runs import and register first."""
+        return Known.of(map(self.study.task, self.study.tasks))
 
     def folder_of(self, cell: Cell) -> Path:
         """A run's folder."""

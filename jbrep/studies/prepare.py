@@ -1,7 +1,7 @@
 """The data sets and encoders that a study's runs need."""
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,7 +16,7 @@ from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.encoders import FULL
 from jbrep.encoders.shipped import UNLEARNED, find, names
-from jbrep.envs.names import INSTANCE, import_modules, imported_modules, is_code
+from jbrep.envs.names import INSTANCE, Known, is_code
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.evaluation.diagnosis import write
@@ -282,19 +282,19 @@ def prepare(plan: Plan, workers: int = 1) -> None:
         plan: the study.
         workers: how many processes go on at a time.
     """
-    _make_all([each for each in every_made(plan) if not each.is_made], workers)
+    _make_all([each for each in every_made(plan) if not each.is_made], workers, plan.known)
     for each in every_made(plan) if plan.study.evaluate else ():
         each.evaluate()
 
 
-def _make_all(waiting: Sequence[NeededData], workers: int) -> None:
+def _make_all(waiting: Sequence[NeededData], workers: int, known: Known) -> None:
     workers = min(workers, cores(), len(waiting))
     if workers < 2:
         for each in waiting:
             each.make(None)
         return
     jobs = iter(waiting)
-    make = partial(_make, max(1, cores() // workers), imported_modules())
+    make = partial(_make, max(1, cores() // workers), known)
     with closing(side_by_side(make, lambda: next(jobs, None), workers)) as made:
         for each, mistake in made:
             if mistake:
@@ -306,10 +306,10 @@ def _make_all(waiting: Sequence[NeededData], workers: int) -> None:
                 )
 
 
-def _make(threads: int, modules: Iterable[str], made: NeededData) -> str:
+def _make(threads: int, known: Known, made: NeededData) -> str:
     """Make a data set and its encoders, in a worker; what a user did wrong."""
     try:
-        import_modules(modules)
+        known.take()
         made.make(threads)
         return ""
     except InputError as error:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from jbrep.envs.names import import_modules, imported_modules
+from jbrep.envs.names import Known
 from jbrep.errors import first_line
 from jbrep.machine import cores
 from jbrep.pool import ATTEMPTS, on_cluster, side_by_side, stop_requested
@@ -48,19 +48,20 @@ class RunOutcome(NamedTuple):
     message: str  # the reason, or how long it took
 
 
-def work(assigned: Assigned, modules: Iterable[str] = ()) -> RunOutcome | None:
+def work(assigned: Assigned, known: Known | None = None) -> RunOutcome | None:
     """Train a run; an error is reported in its outcome and stops no other run.
 
     Args:
         assigned: the run.
-        modules: to import first, as they register environments.
+        known: what a process of its own imports and registers first.
 
     Returns:
         How the run ended; None if it was stopped.
     """
     try:
         make_folder(assigned.folder)
-        import_modules(modules)
+        if known:
+            known.take()
         watch = _Progress(assigned)
         result = train(assigned.run, assigned.folder, Session(watch, stop=stop_requested))
     except StoppedError:
@@ -111,7 +112,7 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
     early, this waits until the runs under way have written their checkpoints.
     """
     jobs = map(plan.assigned, cells)
-    train = partial(work, modules=imported_modules())
+    train = partial(work, known=plan.known)
     on_stop = partial(
         say, "stopping: the runs under way write their checkpoints; Ctrl-C again ends all"
     )
@@ -136,8 +137,7 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[RunOutc
     import ray
 
     task = on_cluster(work, workers, gpus=int(plan.device == "cuda"))
-    known = imported_modules()
-    under_way = {task.remote(plan.assigned(cell), known): cell for cell in cells}
+    under_way = {task.remote(plan.assigned(cell), plan.known): cell for cell in cells}
     try:
         while under_way:
             (done,), _ = ray.wait(list(under_way))
