@@ -35,6 +35,7 @@ from jbrep.parameters import (
     Workers,
     find_study,
 )
+from jbrep.records.keys import checked
 from jbrep.rl.settings import CloneSettings, Seed, TrainingSettings
 from jbrep.rl.settings import Steps as TrainingSteps
 
@@ -122,6 +123,7 @@ class Evaluated(NamedTuple):
         return evaluation_text(self.evaluation, terminal_width())
 
 
+@checked
 def check(
     task: OptionalGivenTask = None,
     /,
@@ -169,6 +171,7 @@ def check(
     return found
 
 
+@checked
 def collect(
     task: GivenTask,
     out: str | Path,
@@ -285,6 +288,7 @@ def train_encoders(
     return (fitter.fit(kind, name=called, **each) for called, each in named)
 
 
+@checked
 def evaluate(
     encoders: Mapping[str, Any] | Sequence[Any] | Any,
     data: "Dataset | str | Path",
@@ -329,6 +333,7 @@ def evaluate(
     return Evaluated(write(found, scaled, Path(out), good, whole))
 
 
+@checked
 def evaluate_policy(
     policy: Acting,
     task: "Task | str | None" = None,
@@ -349,12 +354,11 @@ def evaluate_policy(
     from jbrep.envs.description import as_task
     from jbrep.play.sources import find_player
 
-    if episodes < 1:
-        raise InputError(f"episodes is {episodes}: it must be at least 1")
     player = find_player(policy, None if task is None else as_task(task))
     return player.returns(episodes, threads, retries)
 
 
+@checked
 def train(
     task: GivenDrawnTask,
     out: str | Path,
@@ -411,7 +415,7 @@ def train(
 
     if one_robot := is_one_robot(known, threads):
         preset, settings = preset or MODERN, {**settings, "one_robot": True}
-    overrides = {**overrides, "normalize": normalize} if normalize is not False else overrides
+    overrides = {**overrides, "normalize": True} if normalize else overrides
     settings |= {"encoder": encoder, "seed": seed, "begin_from": begin_from}
     run = Run.of(known, algorithm, preset, overrides, **settings)
     if one_robot and run.learner.hyperparameters.num_envs > 1:
@@ -430,6 +434,7 @@ def train(
     return Agent(folder, record, None if isinstance(encoder, str | Path) else encoder)
 
 
+@checked
 def clone(
     data: "Dataset | str | Path",
     out: str | Path,
@@ -498,6 +503,7 @@ def check_learner(
     return known
 
 
+@checked
 def study(
     study: "Study | Mapping[str, Any] | str | Path",
     out: str | Path | None = None,

@@ -11,7 +11,7 @@ from command import in_this_process
 
 import jbrep
 from jbrep.cli import main
-from jbrep.envs.names import imported_modules
+from jbrep.envs.names import Known
 from jbrep.errors import InputError, Notice
 from jbrep.rl.policy_file import find_shipped as find
 from jbrep.studies.runner import BACKENDS
@@ -155,7 +155,7 @@ def test_a_project_remembers_what_it_imports(tmp_path, monkeypatch):
     def imports(where):
         monkeypatch.chdir(where)
         CliRunner().invoke(main, ["env", "no-such-task"])
-        return imported_modules()
+        return Known.of([]).modules
 
     assert imports(deep) == ()  # a repository of its own
     (deep / ".git").rename(tmp_path / ".git")

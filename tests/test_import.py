@@ -488,7 +488,7 @@ def test_a_killed_import_is_done_again_by_the_same_command(tmp_path):
 
 def test_damage_is_noticed_and_nothing_is_simulated_again(written, tmp_path):
     folder = shutil.copytree(written.folder, tmp_path / "copy")
-    with pytest.raises(InputError, match=r"import their source, pushes of a pole"):
+    with pytest.raises(InputError, match=r"imported from pushes of a pole"):
         list(replay_problems(Dataset(folder), 1))
     flip_bit(shard_path(folder, 0), -8)
     assert len(list(find_problems(folder))) == 1

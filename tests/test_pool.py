@@ -104,7 +104,7 @@ def test_no_worker_outlives_its_parent(delay, tmp_path):
 def test_a_run_that_kills_its_workers_crashes_alone(monkeypatch):
     """Each run has five workers to lose."""
     monkeypatch.setattr(runner, "work", kill_worker_of_first_run)
-    plan = SimpleNamespace(assigned=lambda name: SimpleNamespace(name=name))
+    plan = SimpleNamespace(assigned=lambda name: SimpleNamespace(name=name), known=None)
     *others, crashed = runner.on_this_machine(plan, ("first", "second", "third"), 2)
     assert sorted(others) == ["outcome of second", "outcome of third"]
     assert (crashed.name, crashed.status) == ("first", "crashed")

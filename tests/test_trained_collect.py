@@ -3,7 +3,6 @@
 import pickle
 import shutil
 
-import gymnasium
 import numpy as np
 import pytest
 from command import jbrep
@@ -16,7 +15,7 @@ from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import find_problems
 from jbrep.dataset.schema import joined
 from jbrep.envs import describe
-from jbrep.envs.names import import_modules
+from jbrep.envs.names import Known, import_modules
 from jbrep.inspection.subject import _find
 from jbrep.play.sources import find_player, find_policy
 from jbrep.records import container
@@ -96,7 +95,7 @@ def test_a_worker_makes_the_same_episodes(runs, tmp_path):
     """Of a network that gives actions in [-1, 1] for what has been normalised before."""
     chosen, actor = some(runs / "sledge", tmp_path, task=SLEDGE, store_state=False, steps=80)
     gather(runs / "sledge", tmp_path / "data", {"num_threads": 1}, task=SLEDGE, store_state=False)
-    known = ("environments",), gymnasium.spec(SLEDGE.id)
+    known = Known.of([SLEDGE])
     each = chosen.shard_episodes
     second = range(each, 2 * each)
     sent = pickle.loads(pickle.dumps((known, Simulator(chosen, actor, 1, 1), second)))

@@ -22,11 +22,13 @@ from jbrep.envs.task import EpisodeSteps, Frame, Kind, Task, Word
 from jbrep.envs.view import with_view
 from jbrep.errors import InputError, Notice, refusing
 from jbrep.records.document import read_toml
+from jbrep.records.keys import checked
 from jbrep.records.record import Finite, Record, converted, from_plain, to_plain
 
 _SPREAD_EPISODES = 5  # of random actions
 
 
+@checked
 def describe(
     name: Any,
     env: Mapping[str, Any] | None = None,

@@ -1,12 +1,19 @@
-"""The keys that a record has, as its options on the command line and the docs tell of them."""
+"""What annotations say: of a record's keys, for options and docs, and of a function's arguments."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import wraps
+from inspect import signature
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import msgspec
 from msgspec import NODEFAULT, UNSET, inspect
 
-from jbrep.records.record import Record, default_of, type_of
+from jbrep.records.record import Record, bare, converted, default_of, type_of
+
+_Given = ParamSpec("_Given")
+_Result = TypeVar("_Result")
+_CHECKED = inspect.IntType, inspect.FloatType, inspect.BoolType, inspect.NoneType, inspect.DictType
 
 
 class Key(NamedTuple):
@@ -57,3 +64,29 @@ def keys_of(kind: type[Record]) -> list[Key]:
 def option_name(key: str) -> str:
     """The option that gives a key: --batch-size."""
     return f"--{key.replace('_', '-')}"
+
+
+def checked(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+    """A function that refuses numbers and mappings that its annotations don't allow."""
+    taken = signature(function)
+    kinds = {name: each.annotation for name, each in taken.parameters.items()}
+    kinds = {name: kind for name, kind in kinds.items() if _is_checked(kind)}
+
+    @wraps(function)
+    def call(*given: _Given.args, **named: _Given.kwargs) -> _Result:
+        with suppress(TypeError):  # which the call itself raises
+            for name, value in taken.bind(*given, **named).arguments.items():
+                if name in kinds:
+                    converted(value, kinds[name], name)
+        return function(*given, **named)
+
+    return call
+
+
+def _is_checked(annotation: Any) -> bool:
+    try:
+        kind = type_of(annotation)
+    except (TypeError, NameError):  # of classes, or text that a type checker alone reads
+        return False
+    kinds = kind.types if isinstance(kind, inspect.UnionType) else (kind,)
+    return all(isinstance(bare(each), _CHECKED) for each in kinds)

@@ -450,6 +450,8 @@ def as_study(given: Mapping[str, Any]) -> Study:
     Tables of algorithms become names and learners, which hold what preset files say, and those of
     tasks names and what is described; what is said of all tasks is said of each.
     """
+    if not isinstance(given, Mapping):
+        raise InputError(f"the study is {given!r}: it must be a file, a Study or a dictionary")
     given = dict(given)
     if "env" in given:
         given["environment"] = given.pop("env")

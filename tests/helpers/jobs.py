@@ -35,7 +35,7 @@ def fail(what):
     raise KeyError(what)
 
 
-def kill_worker_of_first_run(name, modules):
+def kill_worker_of_first_run(name, known):
     """Used instead of `work`."""
     if name.name == "first":
         os.kill(os.getpid(), signal.SIGKILL)
