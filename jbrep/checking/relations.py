@@ -26,7 +26,6 @@ _GAIN, _SURE_GAIN = 0.1, 0.03  # of R^2 by a history: the least, and between the
 _LEFT = 0.6  # of the error: what a history leaves, at most
 _OF_ACTIONS = 0.7  # of that gain by past actions alone, where they explain it
 _HARDLY, _MOSTLY, _KNOWN, _SPARE = 0.1, 0.5, 0.8, 0.02  # R^2: bounds of such words; a margin
-_RIDGE = 1e-3  # little, as features less what they were before are small
 _LOSS = 0.01  # of R^2, that what is left out may cost
 _DEPENDS = 0.003, 2.0  # error by a shuffled feature: share of variation, times the error before
 _SLOW, _ENDS = 0.2, 0.2  # change of a place by its deviation; share of ends at extreme values
@@ -65,6 +64,7 @@ class Relations:
     def inputs(self, rows: Array) -> tuple[Array, NDArray[np.int64]]:
         """Observations (n, d) as numbers (n, p) without jumps, and the feature that each is of."""
         made, owners, inside = list[Array](), list[int](), list[int]()
+        rows = self._with_changes(rows)
         for i, feature in enumerate(self._seen.task.features):
             part, turn = [rows[:, i]], self._shapes.turns.get(i)
             if i in self._quaternions:
@@ -77,6 +77,17 @@ class Relations:
                 made += part
                 owners += [i] * len(part)
         return np.column_stack([rows[:, :0], *made]), np.array(owners)
+
+    def _with_changes(self, rows: Array) -> Array:
+        """Changes in place of states before the current one, as regressions shrink small effects."""
+        if not (view := self._seen.task.view):
+            return rows
+        whole = {start + part for start in self._quaternions for part in range(4)}
+        size = len(view.places)
+        before = np.array([i for i in range(size, size * view.history) if i not in whole], int)
+        changed = rows.copy()
+        changed[:, before] = rows[:, before - size] - rows[:, before]
+        return changed
 
     @cached_property
     def _targets(self) -> tuple[Array, list[int]]:
@@ -117,7 +128,7 @@ class Relations:
         from sklearn.preprocessing import StandardScaler
 
         rows = [(given[self._train], wanted[self._train]) for given, wanted in problems]
-        models = [make_pipeline(StandardScaler(), Ridge(_RIDGE)).fit(x, y) for x, y in rows]
+        models = [make_pipeline(StandardScaler(), Ridge()).fit(x, y) for x, y in rows]
         ridges = [lambda x, m=each: m.predict(x).reshape(len(x), -1) for each in models]
         residuals = [y - ridge(x) for (x, y), ridge in zip(rows, ridges, strict=True)]
         parts = [np.hsplit(each, [-1]) if each.shape[1] > 1 else [each] for each in residuals]
