@@ -79,7 +79,7 @@ class Relations:
         return np.column_stack([rows[:, :0], *made]), np.array(owners)
 
     def _with_changes(self, rows: Array) -> Array:
-        """Changes in place of states before the current one, as regressions shrink small effects."""
+        """Changes in place of earlier states, as regressions shrink small effects."""
         if not (view := self._seen.task.view):
             return rows
         whole = {start + part for start in self._quaternions for part in range(4)}

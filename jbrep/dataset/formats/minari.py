@@ -188,9 +188,9 @@ def write(dataset: Dataset, out: Path) -> str:
 def _env_spec(settings: DataSettings) -> EnvSpec | None:
     """What Minari recovers the environment from: with the arguments and the time limit.
 
-    None for one that was registered with a class or function: only a name can be written down.
-    None, too, for imported data of one that isn't there, and where observations are others than
-    what the environment gives: by offsets, or by what is seen of it.
+    None for one that was registered with a function or a class of a script, as only a name in a
+    module can be written down. None, too, for imported data of one that isn't there, and where
+    observations are others than what the environment gives: by offsets, or by what is seen of it.
     """
     task = settings.task
     if task.view or task.offset.any():
@@ -203,7 +203,10 @@ def _env_spec(settings: DataSettings) -> EnvSpec | None:
         raise
     spec.kwargs.update(task.arguments)
     spec.max_episode_steps = task.max_episode_steps
-    return None if callable(spec.entry_point) else spec
+    if callable(maker := spec.entry_point):
+        path, module = getattr(maker, "__qualname__", "."), getattr(maker, "__module__", "__main__")
+        spec.entry_point = None if "." in path or module == "__main__" else f"{module}:{path}"
+    return spec if spec.entry_point else None
 
 
 def _buffers(dataset: Dataset) -> Iterator[EpisodeBuffer]:
