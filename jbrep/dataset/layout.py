@@ -44,9 +44,7 @@ class Layout(Record, frozen=True, kw_only=True):
         str,
         Meta(description="The column of times: dates, or numbers, in s unless a unit is given."),
     ] = ""
-    episode: Annotated[
-        str, Meta(description="A column that changes where an episode ends: numbers or words.")
-    ] = ""
+    episode: Annotated[str, Meta(description="A column with each episode's number or word.")] = ""
     terminated: Annotated[
         str,
         Meta(
