@@ -174,7 +174,6 @@ def drawn(
 
 
 # What Python calls a task by its name or itself is for a command what its options describe.
-NeededTask = Annotated["Task", Meta(extra={"made_by": described})]
 GivenTask = Annotated["Task | str", Meta(extra={"made_by": described})]
 OptionalGivenTask = Annotated["Task | str | None", Meta(extra={"made_by": described})]
 DrawnTask = Annotated["Task", Meta(extra={"made_by": drawn})]

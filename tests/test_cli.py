@@ -123,6 +123,7 @@ MISTAKES = {
     "env environments:Sledge": "Sledge has no time limit: give one with --episode-steps",
     "train-dae --data none --latent 8 --out x": "no data set in none",
     "data derive none --hide x --out x": "no data set in none",
+    "encoder import a.onnx --out x": "give --task, or else --data",
     "data fly": "No such command 'fly'. See jbrep data --help.",
     "evaluate-policy none": "none is no data set, no run",
     "collect --task face_direction --steps 1 --policy sprint --out x": "unknown policy 'sprint'",

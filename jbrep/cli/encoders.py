@@ -10,7 +10,7 @@ from jbrep import api
 from jbrep.cli.base import command, say, say_json, tell
 from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
-from jbrep.parameters import AsJson, NeededTask, OptionalTask, TaskName
+from jbrep.parameters import AsJson, OptionalTask, TaskName
 from jbrep.text import facts, r2_text, slug, table, terminal_width
 
 if TYPE_CHECKING:
@@ -179,7 +179,14 @@ def export(encoder: _Which, /, out: Path, *, task: OptionalTask = None) -> None:
 
 @command("encoder import model.onnx --task face_direction --out encoders/mine.safetensors")
 def import_model(
-    model: Path, /, task: NeededTask, out: Path, *, decoder: Path | None = None, name: str = ""
+    model: Path,
+    /,
+    out: Path,
+    *,
+    task: OptionalTask = None,
+    data: Annotated[Path | None, Meta(extra={"metavar": "FOLDER"})] = None,
+    decoder: Path | None = None,
+    name: str = "",
 ) -> None:
     """Make an encoder file from an ONNX model.
 
@@ -188,15 +195,20 @@ def import_model(
 
     Args:
         out: a new encoder file.
+        data: a data set whose observations it encodes, in place of a task.
         decoder: a model from latents back to observations, if MODEL has no reconstruction.
         name: what tables will call it; by default the name of the file.
     """
+    from jbrep.dataset import Dataset
     from jbrep.encoders.encoder import SUFFIX, Encoder, pack
     from jbrep.records.storage import exists, taken, write_new
 
     if exists(out):
         raise taken(out)
-    made = Encoder.from_onnx(model, task, decoder, name or out.name.removesuffix(SUFFIX))
+    if (task is None) == (data is None):
+        raise InputError("give --task, or else --data, a folder from jbrep data import")
+    known = task or Dataset(data or "").task
+    made = Encoder.from_onnx(model, known, decoder, name or out.name.removesuffix(SUFFIX))
     write_new(out, pack(made))
     say(card(made, str(out), terminal_width()))
 
