@@ -30,7 +30,7 @@ _claims: Any = claims
 _claims.ratio_of_spreads = lambda curves, *how: Interval(
     np.exp(claims._excess(curves, 0.0)), np.nan, np.nan
 )
-_claims.spread_p = partial(claims.spread_p, permutations=999)  # in place of ten times as many
+_spread_p = partial(claims.spread_p, permutations=999)  # in place of ten times as many
 
 Array = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, Array], Array]  # final returns, from what seeds share
@@ -123,12 +123,13 @@ def study(truth: Truth, runs: int, seed: int) -> dict[str, list[RunCurve]]:
 
 def judged(name: str, runs: int, seed: int) -> tuple[str, ...]:
     """The verdicts on a made-up study."""
+    _claims.spread_p = partial(_spread_p, seed=seed)  # independent from study to study
     group, alone = study(TRUTHS[name], runs, seed), [BETTER.name]
     found = []
     for chain in (alone, [each for each in CLAIMS if each not in alone]):
         rules = Rules(claims=tuple(f"{X} {each} than {Y}" for each in chain))
         planned = Planned(rules, tuple(range(runs)), ((TASK, ALGORITHM),))
-        found += [each.verdict for each in planned({(TASK, ALGORITHM): group}, seed)]
+        found += [each.verdict for each in planned({(TASK, ALGORITHM): group})]
     return tuple(found)
 
 

@@ -86,7 +86,7 @@ def test_the_permutation_of_curves_swaps_sides_of_units():
         spreads = (np.log(median_abs_deviation(v) + 1e-9)[0] for v in (p, q))
         each.append(next(spreads) - next(spreads))
     beyond = min(np.mean(each >= each[0] - 1e-9), np.mean(each <= each[0] + 1e-9))
-    ours = spread_p(Curves(x, y, np.ones(1), 1e-9), 0)
+    ours = spread_p(Curves(x, y, np.ones(1), 1e-9))
     assert ours == pytest.approx(min(1, 2 * beyond), abs=0.02)
 
 
@@ -95,18 +95,18 @@ def test_the_interval_of_a_ratio_of_spreads_is_what_the_test_keeps():
     y = random.normal(0, 50, (16, 1)) + random.normal(0, 10, (16, 9))
     x = random.normal(0, 12, (16, 1)) + random.normal(0, 3, (16, 9))
     curves = Curves(x, y, np.full(9, 1 / 9), 1.0)
-    value, low, high = ratio_of_spreads(curves, 0.95, 0)
+    value, low, high = ratio_of_spreads(curves, 0.95)
     assert low < value < high < 1
-    assert spread_p(curves, 0) < 0.05
-    twice = ratio_of_spreads(curves._replace(x=2 * x), 0.95, 0)
+    assert spread_p(curves) < 0.05
+    twice = ratio_of_spreads(curves._replace(x=2 * x), 0.95)
     np.testing.assert_allclose(twice, 2 * np.array([value, low, high]), rtol=2e-3)
     equal = Curves(y, y + 100, np.full(9, 1 / 9), 1.0)
-    assert ratio_of_spreads(equal, 0.95, 0).value == pytest.approx(1)
-    assert spread_p(equal, 0) > 0.9
+    assert ratio_of_spreads(equal, 0.95).value == pytest.approx(1)
+    assert spread_p(equal) > 0.9
     one_step = Curves(x[:12, :1], y[:12, :1] / 2, np.ones(1), 0.01)
-    p = spread_p(one_step, 0)  # and the interval at other levels, as of many claims, agrees with it
-    assert ratio_of_spreads(one_step, 1 - 1.2 * p, 0).high < 1
-    assert ratio_of_spreads(one_step, 1 - 0.8 * p, 0).high > 1
+    p = spread_p(one_step)  # and the interval at other levels, as of many claims, agrees with it
+    assert ratio_of_spreads(one_step, 1 - 1.2 * p).high < 1
+    assert ratio_of_spreads(one_step, 1 - 0.8 * p).high > 1
 
 
 def measured(full, other, seeds=None):

@@ -358,7 +358,7 @@ def _diagnosed(tables: Tables, analysis: Analysis) -> Iterator[Diagnosed]:
                 continue
             families = [family_of[group.task, each] for each in known]
             x, y = np.array([*known.values()]), np.array([returns[each] for each in known])
-            correlation = rank_correlation(scalar.better * x, y, families, analysis.seed)
+            correlation = rank_correlation(scalar.better * x, y, families)
             yield Diagnosed(
                 task=group.task,
                 algorithm=group.algorithm,

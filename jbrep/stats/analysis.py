@@ -97,7 +97,6 @@ class GroupAnalysis:
 class Analysis:
     """The results of a study."""
 
-    seed: int  # of all resampling
     planned: Planned  # what reached the verdicts
     groups: tuple[GroupAnalysis, ...]  # by task and algorithm
     verdicts: tuple[Verdict, ...]  # on all claims that were registered, by task and algorithm
@@ -110,10 +109,7 @@ class Analysis:
 
 
 def analyse(
-    runs: Sequence[RunCurve],
-    planned: Planned | None = None,
-    seed: int = 0,
-    references: References | None = None,
+    runs: Sequence[RunCurve], planned: Planned | None = None, references: References | None = None
 ) -> Analysis:
     """All numbers and verdicts of a study; they don't depend on the order of its runs.
 
@@ -122,30 +118,25 @@ def analyse(
     """
     planned = planned or Planned()
     by_group, played = groups(runs, planned.rules.baseline), references or {}
-    verdicts = planned(by_group, seed)
+    verdicts = planned(by_group)
     analysed = tuple(
         _analyse_group(
             group,
             tuple(each for each in verdicts if (each.task, each.algorithm) == key),
             played.get(key[0], {}),
-            seed,
         )
         for key, group in by_group.items()
     )
     return Analysis(
-        seed=seed,
         planned=planned,
         groups=analysed,
         verdicts=tuple(verdicts),
-        aggregates=tuple(aggregates(_scores(analysed), seed)),
+        aggregates=tuple(aggregates(_scores(analysed))),
     )
 
 
 def _analyse_group(
-    group: Group,
-    verdicts: tuple[Verdict, ...],
-    references: Mapping[str, Sequence[float]],
-    seed: int,
+    group: Group, verdicts: tuple[Verdict, ...], references: Mapping[str, Sequence[float]]
 ) -> GroupAnalysis:
     first, known, starts = evaluated_run(group), compared(group), None
     if len(first.steps):
@@ -157,7 +148,7 @@ def _analyse_group(
     }
     scale = scale_of(known, played)
     baseline, *others = (
-        describe(runs, known.curves[name], known.finals[name], scale, seed)
+        describe(runs, known.curves[name], known.finals[name], scale)
         for name, runs in group.items()
     )
     return GroupAnalysis(
@@ -169,7 +160,7 @@ def _analyse_group(
         failure_return=first.failure_return,
         references=played,
         labels=(baseline, *others),
-        comparisons=tuple(compare(each, baseline, known, seed) for each in others),
+        comparisons=tuple(compare(each, baseline, known) for each in others),
         verdicts=verdicts,
         **scale._asdict(),
     )
@@ -186,16 +177,14 @@ def _scores(groups: Sequence[GroupAnalysis]) -> dict[str, dict[str, dict[str, Ar
 
 
 def compare(
-    label: RepresentationResult, baseline: RepresentationResult, known: Compared, seed: int
+    label: RepresentationResult, baseline: RepresentationResult, known: Compared
 ) -> Comparison:
     """A representation against the baseline of the same task and algorithm."""
     finals = label.by_run["final_return"], baseline.by_run["final_return"]
     found = paired(known, label.representation, baseline.representation)
-    numbers = _differences(found, seed) if found else dict.fromkeys(_PAIRED, UNDEFINED)
+    numbers = _differences(found) if found else dict.fromkeys(_PAIRED, UNDEFINED)
     numbers["variance_ratio"] = variance_ratio(*finals)
-    numbers["probability_of_improvement"] = percentile(
-        probability_of_improvement, *finals, seed=seed
-    )
+    numbers["probability_of_improvement"] = percentile(probability_of_improvement, *finals)
     return Comparison(
         representation=label.representation,
         numbers=numbers,
@@ -205,7 +194,7 @@ def compare(
     )
 
 
-def _differences(pair: Pair, seed: int) -> dict[str, Interval]:
+def _differences(pair: Pair) -> dict[str, Interval]:
     """What is compared unit by unit; shares of gains and ratios only where the baseline learned."""
     x, y = pair.x, pair.y
     score = pair.ends.score(x.final) - pair.ends.score(y.final)
@@ -216,8 +205,8 @@ def _differences(pair: Pair, seed: int) -> dict[str, Interval]:
         *(
             (
                 share_of_gain(x.final, y.final, pair.ends.blind, LEVEL),
-                FASTER.estimate(pair, LEVEL, seed),
-                LESS_VARIABLE.estimate(pair, LEVEL, seed),
+                FASTER.estimate(pair, LEVEL),
+                LESS_VARIABLE.estimate(pair, LEVEL),
             )
             if pair.y_learns
             else [UNDEFINED] * 3
@@ -242,9 +231,7 @@ def _brown_forsythe(x: Array, y: Array) -> float:
     return float(levene(x, y, center="median").pvalue)
 
 
-def aggregates(
-    scores: Mapping[str, Mapping[str, Mapping[str, Array]]], seed: int
-) -> Iterator[Aggregate]:
+def aggregates(scores: Mapping[str, Mapping[str, Mapping[str, Array]]]) -> Iterator[Aggregate]:
     """The results of each algorithm and representation that has runs on two tasks or more.
 
     After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical
@@ -256,11 +243,11 @@ def aggregates(
         for name in names if len(by_task) > 1 else ():
             if all(name in by_name for by_name in by_task.values()):
                 own = [by_name[name] for by_name in by_task.values()]
-                yield _aggregate(algorithm, name, tuple(by_task), own, seed)
+                yield _aggregate(algorithm, name, tuple(by_task), own)
 
 
 def _aggregate(
-    algorithm: str, name: str, tasks: tuple[str, ...], scores: Sequence[Array], seed: int
+    algorithm: str, name: str, tasks: tuple[str, ...], scores: Sequence[Array]
 ) -> Aggregate:
     runs = min(map(len, scores))
 
@@ -268,7 +255,7 @@ def _aggregate(
         def of_samples(*samples: Array) -> Array:
             return statistic(np.concatenate(samples, axis=-1))
 
-        return percentile(of_samples, *(each[:runs] for each in scores), seed=seed)
+        return percentile(of_samples, *(each[:runs] for each in scores))
 
     return Aggregate(
         algorithm=algorithm,

@@ -31,14 +31,12 @@ class Claim(NamedTuple):
     name: str  # as in "x NAME than y"
     side: int  # 1 if an estimate above the boundary speaks for the claim, -1 if one below does
     boundary: Callable[[Pair, float], float]  # of the estimate, given the margin
-    # with an interval of a level; the seed is that of permutations
-    estimate: Callable[[Pair, float, int], Interval]
-    # two-sided, of the estimand lying on the boundary, from a pair, the boundary and a seed
-    p_value: Callable[[Pair, float, int], float]
+    estimate: Callable[[Pair, float], Interval]  # with an interval of a level
+    p_value: Callable[[Pair, float], float]  # two-sided, of the estimand lying on the boundary
     is_of_returns: bool = False  # whether the estimate is a difference of returns
     takes_learning: bool = True  # whether it says nothing where agents on y don't learn
     # the estimate with the interval that the test itself keeps, if that is another
-    tested: Callable[[Pair, float, int], Interval] | None = None
+    tested: Callable[[Pair, float], Interval] | None = None
 
 
 def _returns(pair: Pair) -> Array:
@@ -49,12 +47,12 @@ def _steps(pair: Pair) -> Array:
     return pair.x.steps - pair.y.steps
 
 
-def difference(of: Callable[[Pair], Array], pair: Pair, level: float, seed: int = 0) -> Interval:
+def difference(of: Callable[[Pair], Array], pair: Pair, level: float) -> Interval:
     """The mean of differences between the sides of units, with Student's interval."""
     return mean_within(of(pair), Bounds(), level)
 
 
-def _difference_p(of: Callable[[Pair], Array], pair: Pair, boundary: float, seed: int) -> float:
+def _difference_p(of: Callable[[Pair], Array], pair: Pair, boundary: float) -> float:
     values = of(pair)
     return np.nan if constant(values) else float(ttest_1samp(values, boundary).pvalue)
 
@@ -84,9 +82,7 @@ def _median(values: Array) -> Array:
     return (ordered[..., last // 2] + ordered[..., -(-last // 2)]) / 2
 
 
-def ratio_of_spreads(
-    curves: Curves, level: float, seed: int, permutations: int = TO_SHOW
-) -> Interval:
+def ratio_of_spreads(curves: Curves, level: float, permutations: int = TO_SHOW) -> Interval:
     """By what the deviations of x must be divided to spread like those of y, with an interval.
 
     The interval has the ratios that the permutation test doesn't reject (Hodges and Lehmann 1963):
@@ -101,7 +97,7 @@ def ratio_of_spreads(
         value = float(brentq(partial(_excess, curves), -_FURTHEST, _FURTHEST))
     else:
         value = _FURTHEST if least >= 0 else -_FURTHEST
-    drawn = _permuted(curves, permutations, seed)
+    drawn = _permuted(curves, permutations)
 
     def is_rejected(log_ratio: float) -> bool:
         return _p(curves, log_ratio, drawn) <= 1 - level
@@ -116,7 +112,7 @@ def _ratio(log_ratio: float) -> float:
     return np.inf if log_ratio > 0 else 0.0
 
 
-def spread_p(curves: Curves, seed: int, permutations: int = PERMUTATIONS) -> float:
+def spread_p(curves: Curves, permutations: int = PERMUTATIONS, seed: int = 0) -> float:
     """P-value of equal spreads: curves of a unit swap sides, after taking off their side's median.
 
     Two-sided, twice the smaller share, as that of few curves isn't symmetrical (Phipson and Smyth
@@ -137,12 +133,12 @@ def _excess(curves: Curves, log_ratio: float) -> float:
     return float(log_spread(x.T, *how) - log_spread(y.T, *how))
 
 
-def swaps(units: int, count: int, seed: int) -> NDArray[np.bool_]:
+def swaps(units: int, count: int, seed: int = 0) -> NDArray[np.bool_]:
     """Which units swap sides in each permutation, (count, units)."""
     return np.random.default_rng(seed).random((count, units)) < 0.5
 
 
-def _permuted(curves: Curves, count: int, seed: int) -> NDArray[np.int64]:
+def _permuted(curves: Curves, count: int, seed: int = 0) -> NDArray[np.int64]:
     """Orders of all curves, (count, 2 n), in which units may have swapped sides."""
     runs, every = len(curves.x), np.arange(2 * len(curves.x))
     swapped = np.tile(swaps(runs, count, seed), 2)
@@ -207,8 +203,8 @@ LESS_VARIABLE = Claim(
     name="less variable",
     side=-1,
     boundary=lambda pair, margin: 1.0,
-    estimate=lambda pair, level, seed: ratio_of_spreads(_curves(pair), level, seed),
-    tested=lambda pair, level, seed: ratio_of_spreads(_curves(pair), level, seed, PERMUTATIONS),
-    p_value=lambda pair, boundary, seed: spread_p(_curves(pair), seed),
+    estimate=lambda pair, level: ratio_of_spreads(_curves(pair), level),
+    tested=lambda pair, level: ratio_of_spreads(_curves(pair), level, PERMUTATIONS),
+    p_value=lambda pair, boundary: spread_p(_curves(pair)),
 )
 CLAIMS = {claim.name: claim for claim in (BETTER, NOT_WORSE, FASTER, LESS_VARIABLE)}

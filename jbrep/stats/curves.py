@@ -81,10 +81,10 @@ def on_grid(run: RunCurve, grid: Array) -> Array:
     return np.interp(grid, *run.curve())
 
 
-def bands(curves: Array, seed: int) -> Curve:
+def bands(curves: Array) -> Curve:
     """Percentiles and means of curves (runs, g) at each step, from resampling whole curves."""
     parts = [
-        percentile(iqm, curves.T[first : first + _POINTS], seed=seed)
+        percentile(iqm, curves.T[first : first + _POINTS])
         for first in range(0, curves.shape[1], _POINTS)
     ]
     iqm_of_all = Interval(*(np.concatenate(part) for part in zip(*parts, strict=True)))

@@ -29,7 +29,7 @@ _FEWEST_PAIRS = 5  # or families for an interval: with fewer, ranks agree by cha
 FEWEST_RUNS = 4  # for an interval: three or fewer are better shown as points
 
 
-def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) -> Interval:
+def percentile(statistic: Callable[..., Array], *samples: Array) -> Interval:
     """A statistic with its 95 % percentile interval, from a stratified bootstrap over whole runs.
 
     Resamples in which the statistic is undefined widen the interval at both ends. Of fewer runs
@@ -40,7 +40,7 @@ def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) 
         with np.errstate(divide="ignore", invalid="ignore"):
             value = statistic(*samples)
         return Interval(value, value * np.nan, value * np.nan)
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     drawn = []
     for sample in samples:
         runs = sample.shape[-1]
@@ -185,7 +185,7 @@ def share_of_gain(x: Array, y: Array, reference: float, level: float) -> Interva
     return Interval(value, float(b - half) / a, float(b + half) / a)
 
 
-def rank_correlation(x: Array, y: Array, families: Sequence[str], seed: int = 0) -> Interval:
+def rank_correlation(x: Array, y: Array, families: Sequence[str]) -> Interval:
     """Spearman's rank correlation of finite x and y, (n,), with its percentile bootstrap interval.
 
     Spearman 1904, "The proof and measurement of association between two things": Pearson's
@@ -202,13 +202,11 @@ def rank_correlation(x: Array, y: Array, families: Sequence[str], seed: int = 0)
     """
     if len(x) < _FEWEST_PAIRS or np.ptp(x) == 0 or np.ptp(y) == 0:
         return UNDEFINED
-    found = over_families(lambda times: correlation_of_ranks(x, y, times), families, seed)
+    found = over_families(lambda times: correlation_of_ranks(x, y, times), families)
     return found if len({*families}) >= _FEWEST_PAIRS else UNDEFINED._replace(value=found.value)
 
 
-def over_families(
-    statistic: Callable[[Array], Array], families: Sequence[str], seed: int = 0
-) -> Interval:
+def over_families(statistic: Callable[[Array], Array], families: Sequence[str]) -> Interval:
     """A statistic of encoders that each come so many times, (..., n), resampled by families."""
     names, family = np.unique(families, return_inverse=True)
     numbers = np.arange(len(names), dtype=np.float64)
@@ -217,7 +215,7 @@ def over_families(
         times = (drawn[..., None] == numbers).sum(axis=-2)
         return statistic(times[..., family])
 
-    return percentile(of_drawn, numbers, seed=seed)
+    return percentile(of_drawn, numbers)
 
 
 def correlation_of_ranks(x: Array, y: Array, times: Array) -> Array:

@@ -56,7 +56,7 @@ class RepresentationResult:
 
 
 def describe(
-    runs: list[RunCurve], curves: Array, final: Array, scale: Scale, seed: int
+    runs: list[RunCurve], curves: Array, final: Array, scale: Scale
 ) -> RepresentationResult:
     """The results of a representation, from its runs in the order of seeds.
 
@@ -79,13 +79,10 @@ def describe(
         failed=tuple(int(run.seed) for run in runs if run.failed_at is not None),
         encoders=len({run.encoder_seed for run in runs}),
         learnt=learnt(of_units(final, encoders), scale.blind, runs[0].bounds),
-        curve=bands(curves, seed),
+        curve=bands(curves),
         by_run=by_run,
-        numbers={
-            **_numbers(by_run, encoders, runs[0].bounds, seed),
-            **_components(encoders, final),
-        },
-        profile=profile(by_run["final_return"], scale.profile_returns, seed),
+        numbers={**_numbers(by_run, encoders, runs[0].bounds), **_components(encoders, final)},
+        profile=profile(by_run["final_return"], scale.profile_returns),
     )
 
 
@@ -99,10 +96,10 @@ def learnt(final: Array, blind: Interval, bounds: Bounds) -> str:
     return UNCLEAR if final.mean() > blind.value else NO
 
 
-def profile(final_return: Array, returns: Array, seed: int) -> Interval:
+def profile(final_return: Array, returns: Array) -> Interval:
     """A performance profile (Agarwal et al. 2021): the shares of runs (n,) above returns (k,)."""
     above = (final_return > returns[:, None]).astype(float)
-    return percentile(lambda values: values.mean(axis=-1), above, seed=seed)
+    return percentile(lambda values: values.mean(axis=-1), above)
 
 
 def _components(encoders: Units, final: Array) -> dict[str, Interval]:
@@ -170,26 +167,22 @@ def _mean(values: Array, encoders: Units, bounds: Bounds) -> Interval:
     return unless_few(mean_within(values, bounds, LEVEL), len(values))
 
 
-def _numbers(
-    by_run: Mapping[str, Array], encoders: Units, bounds: Bounds, seed: int
-) -> dict[str, Interval]:
+def _numbers(by_run: Mapping[str, Array], encoders: Units, bounds: Bounds) -> dict[str, Interval]:
     numbers = {}
     for name in ("final_return", "mean_return"):
         values = by_run[name]
         numbers[f"{name}_mean"] = _mean(values, encoders, bounds)
-        numbers[f"{name}_median"] = percentile(_median, values, seed=seed)
-        numbers[f"{name}_iqm"] = percentile(iqm, values, seed=seed)
+        numbers[f"{name}_median"] = percentile(_median, values)
+        numbers[f"{name}_iqm"] = percentile(iqm, values)
     for name in ("gain", "score", "rise"):
         numbers[name] = _mean(by_run[name], encoders, Bounds())
     final = by_run["final_return"]
     numbers["final_return_sd"] = deviation(final)
-    numbers["final_return_iqr"] = percentile(lambda v: iqr(v, axis=-1), final, seed=seed)
-    numbers["final_return_mad"] = percentile(
-        lambda v: median_abs_deviation(v, axis=-1), final, seed=seed
-    )
-    numbers["risk_across_runs"] = percentile(expected_shortfall, final, seed=seed)
+    numbers["final_return_iqr"] = percentile(lambda v: iqr(v, axis=-1), final)
+    numbers["final_return_mad"] = percentile(lambda v: median_abs_deviation(v, axis=-1), final)
+    numbers["risk_across_runs"] = percentile(expected_shortfall, final)
     for name in STEPS_TO:
-        numbers[name] = percentile(_median, by_run[name], seed=seed)
+        numbers[name] = percentile(_median, by_run[name])
         numbers[REACHED[name]] = _share_reached(by_run[name])
     return numbers
 

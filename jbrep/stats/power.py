@@ -67,7 +67,7 @@ def _least_p(claim: Stated, units: int) -> float:
     """Two-sided, of swaps of sides as `spread_p` draws them; that of a mean can be any."""
     if claim.claim.name != LESS_VARIABLE.name:
         return 0.0
-    same = (~swaps(units, PERMUTATIONS, 0)).all(axis=1).sum()  # none swaps, as in the data
+    same = (~swaps(units, PERMUTATIONS)).all(axis=1).sum()  # none swaps, as in the data
     return float(2 * (1 + same) / (1 + PERMUTATIONS))
 
 
@@ -86,5 +86,5 @@ def _power_of_spread(ratio: float, units: int, level: float) -> float:
     found = 0
     for seed in range(_STUDIES_OF_CURVES):
         x, y = (random.normal(0, sd, (units, 1)) for sd in (ratio, 1))
-        found += spread_p(Curves(x, y, np.ones(1), 0.01), seed, count) <= level
+        found += spread_p(Curves(x, y, np.ones(1), 0.01), count, seed) <= level
     return found / _STUDIES_OF_CURVES

@@ -164,7 +164,7 @@ class Planned:
         """The level at which each chain of claims begins."""
         return self.rules.error / max(1, len(self.rules.chains) * len(self.groups))
 
-    def __call__(self, groups: Mapping[Key, Group], seed: int = 0) -> list[Verdict]:
+    def __call__(self, groups: Mapping[Key, Group]) -> list[Verdict]:
         """What is found of each claim, on each planned task and algorithm."""
         chains = [
             _Chain(key, x, y, claims, self._pair(key, groups.get(key, {}), x, y), self.share)
@@ -173,13 +173,13 @@ class Planned:
         ]
         waiting = chains
         while waiting:
-            decided = [chain for chain in waiting if chain.test(self.rules, seed)]
+            decided = [chain for chain in waiting if chain.test(self.rules)]
             waiting = [chain for chain in chains if not chain.is_done] if decided else []
             for chain in decided:
                 if chain.is_done:
                     for other in waiting:
                         other.level += chain.level / len(waiting)
-        return [verdict for chain in chains for verdict in chain.every(self.rules, seed)]
+        return [verdict for chain in chains for verdict in chain.every(self.rules)]
 
     def _pair(self, key: Key, group: Group, x: str, y: str) -> Pair | str:
         if reason := self.prevented.get(key[0]):
@@ -210,19 +210,19 @@ class _Chain:
         contradicted = any(each.verdict == CONTRADICTED for each in self.decided)
         return contradicted or len(self.decided) == len(self.claims)
 
-    def test(self, rules: Rules, seed: int) -> bool:
+    def test(self, rules: Rules) -> bool:
         """Test the claims that are left, one after the other; whether any was decided."""
         before = len(self.decided)
         while not (self.is_done or isinstance(self.pair, str)):
             claim = self.claims[len(self.decided)]
-            verdict = _tested(self._estimated(claim, self.pair, rules, seed), claim, self, seed)
+            verdict = _tested(self._estimated(claim, self.pair, rules), claim, self)
             self.undecided = verdict if verdict.verdict == UNDECIDED else None
             if self.undecided:
                 break
             self.decided.append(verdict)
         return len(self.decided) > before
 
-    def every(self, rules: Rules, seed: int) -> Iterator[Verdict]:
+    def every(self, rules: Rules) -> Iterator[Verdict]:
         """A verdict on each claim: decided, tested last, or not tested."""
         yield from self.decided
         if self.undecided:
@@ -234,20 +234,20 @@ class _Chain:
             else:
                 assert last
                 reason = f"not tested: {last.claim!r} is {last.verdict}"
-                yield replace(self._estimated(claim, self.pair, rules, seed), reason=reason)
+                yield replace(self._estimated(claim, self.pair, rules), reason=reason)
 
     def _about(self, claim: Claim) -> dict[str, Any]:
         task, algorithm = self.key
         of = {"task": task, "algorithm": algorithm, "x": self.x, "claim": claim.name, "y": self.y}
         return {**of, "verdict": UNDECIDED}
 
-    def _estimated(self, claim: Claim, pair: Pair, rules: Rules, seed: int) -> Verdict:
+    def _estimated(self, claim: Claim, pair: Pair, rules: Rules) -> Verdict:
         learnt = pair.y_learns or not claim.takes_learning
         boundary = claim.boundary(pair, rules.margin)
         reason = None if learnt else f"agents on {self.y} aren't above the blind baselines"
         if math.isnan(boundary):
             reason = "no reference policy is known that would score 1"
-        estimate = UNDEFINED if reason else claim.estimate(pair, LEVEL, seed)
+        estimate = UNDEFINED if reason else claim.estimate(pair, LEVEL)
         estimate = unless_few(estimate, pair.units)
         return Verdict(
             **self._about(claim),
@@ -263,13 +263,13 @@ class _Chain:
         )
 
 
-def _tested(estimated: Verdict, claim: Claim, chain: _Chain, seed: int) -> Verdict:
+def _tested(estimated: Verdict, claim: Claim, chain: _Chain) -> Verdict:
     pair = chain.pair
     assert isinstance(pair, Pair)
     if estimated.reason:
         return estimated
     boundary, level = estimated.boundary, chain.level
-    p = claim.p_value(pair, boundary, seed)
+    p = claim.p_value(pair, boundary)
     direction = int(claim.side * np.sign(estimated.estimate.value - boundary)) if p <= level else 0
     reason = "nothing varies from run to run" if np.isnan(p) else None
     if pair.units < FEWEST_UNITS:
@@ -282,7 +282,7 @@ def _tested(estimated: Verdict, claim: Claim, chain: _Chain, seed: int) -> Verdi
         verdict={1: SUPPORTED, -1: CONTRADICTED, 0: UNDECIDED}[0 if reason else direction],
         p=p,
         level=level,
-        interval=(claim.tested or claim.estimate)(pair, 1 - level, seed),
+        interval=(claim.tested or claim.estimate)(pair, 1 - level),
         reason=reason,
     )
 
