@@ -54,18 +54,17 @@ def _statistics(tables: study.Tables) -> tuple[Analysis | None, list[str]]:
 def _comparable(runs: list[RunCurve], baseline: str) -> tuple[list[RunCurve], list[str]]:
     """The runs that there can be statistics of, though others are missing; what is left out."""
     counts = Counter((run.task, run.algorithm, run.representation) for run in runs)
-    alone = {
-        key: f"{'/'.join(key)}: one run has ended, at least two are needed"
-        for key, count in counts.items()
-        if count == 1
+    alone = {key for key, count in counts.items() if count == 1}
+    others = {key for key in counts if counts[*key[:2], baseline] < 2} - alone
+    why = {
+        "one run has ended, at least two are needed": alone,
+        f"at least two runs of {baseline} are needed to compare it with": others,
     }
-    alone |= {
-        key: f"{'/'.join(key)}: at least two runs of {baseline} are needed to compare it with"
-        for key in counts
-        if counts[*key[:2], baseline] < 2 and key not in alone
-    }
-    kept = [run for run in runs if (run.task, run.algorithm, run.representation) not in alone]
-    return kept, sorted(alone.values())
+    kept = [
+        run for run in runs if (run.task, run.algorithm, run.representation) not in alone | others
+    ]
+    said = {reason: listed(sorted(map("/".join, keys))) for reason, keys in why.items() if keys}
+    return kept, [f"{names}: {reason}" for reason, names in said.items()]
 
 
 def _without_refused(runs: list[RunCurve], baseline: str) -> tuple[list[RunCurve], list[str]]:
