@@ -108,6 +108,8 @@ def find_all(given: Any, task: Task) -> dict[str, BaseEncoder]:
     That is a name that the user gives in a dictionary, or else the encoder's own, or where it is
     from if that is taken.
     """
+    if isinstance(given, (Mapping, list, tuple)) and not given:
+        raise InputError("no encoder is given: give one, several, or several by names of yours")
     if isinstance(given, Mapping):
         return {label: find(each, task) for label, each in given.items()}
     several = given if isinstance(given, (list, tuple)) else [given]
