@@ -121,3 +121,10 @@ def test_the_benchmark_of_methods_takes_each_of_them(monkeypatch):
         chosen.check_data(data)
         if isinstance(chosen, Learned):
             chosen.objective(data)
+
+
+def test_the_paper_s_table_has_a_row_for_each_task_and_algorithm(capsys, tmp_path):
+    import table
+
+    table.main(str(tmp_path / "it.png"), str(ROOT / "results/small-face-direction"))
+    assert "sac-wide | 473 ± " in capsys.readouterr().out.splitlines()[2]
