@@ -58,18 +58,20 @@ def make_report(folder: Path, out: Path | None = None, evaluations: Sequence[str
     Evaluations are those of `add_diagnostics`.
     """
     out, ran = out or folder, has_runs(folder)
+    is_own = out.resolve() == folder.resolve()
     if ran and out != folder and not os.access(folder, os.W_OK):  # it has its tables already
         ran = False
     if not ran:
         check_tables(folder)
-    make_folder(out, () if out.resolve() == folder.resolve() else (FINDINGS,))
-    written = [folder, out] if ran or evaluations else [out]
+    make_folder(out, () if is_own else (FINDINGS,))
+    changes = ran or is_own or bool(evaluations)
+    written = [folder, out] if changes else [out]
     with ExitStack() as stack:
         for each in sorted({each.resolve() for each in written}):
             stack.enter_context(writing(each))
         if ran:
             write_tables(folder)
-        notes = add_diagnostics(folder, evaluations)
+        notes = add_diagnostics(folder, evaluations) if changes else []
         tables = read_tables(folder)
         found = Findings.of(tables)
         return Report(out, tables, found, notes, write_report(found, out))

@@ -65,7 +65,7 @@ class RunCurve:
                 "a curve needs at least two; the episodes of one evaluation are not runs",
             )
         every, (low, high) = np.concatenate([*self.evaluations, []]), self.bounds
-        rounding = _ROUNDING * max(1, np.abs(every).max(initial=0))
+        rounding = max(6e-4, _ROUNDING * np.abs(every).max(initial=0))  # tables have 3 decimals
         if (every < low - rounding).any() or (every > high + rounding).any():
             raise self._error(
                 f"it returned {every.min():g} to {every.max():g}",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from msgspec import UNSET, Meta, UnsetType
-from msgspec.structs import force_setattr
+from msgspec.structs import asdict, force_setattr
 
 from jbrep.collecting.policies import Uniform
 from jbrep.dataset.manifest import MANIFEST
@@ -299,7 +299,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if (other := folders.setdefault(folder, task)) != task:
                 raise InputError(f"{other} and {task} would share a folder: study one of them here")
         try:
-            json.dumps([self.environment, to_plain(self.described)], allow_nan=False)
+            json.dumps([self.environment, *map(asdict, self.described.values())], allow_nan=False)
         except (TypeError, ValueError):
             raise InputError(
                 "env has a date, or a number that is not finite: its values must be text, "
@@ -319,7 +319,8 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 f"verdicts.baseline is {baseline!r}: it must be one of the representations, "
                 f"{', '.join(names)}"
             )
-        for claim in self.verdicts.stated:
+        stated = self.planned.rules.stated
+        for claim in stated:
             if unknown := {claim.x, claim.y}.difference(names):
                 raise InputError(
                     f"verdicts.claims has {str(claim)!r}: {min(unknown)} is none of the "
@@ -333,7 +334,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             or each.hide
             or (each.history or 1) > 1
         ]
-        absolute = all(claim.claim != NOT_WORSE for claim in self.verdicts.stated)
+        absolute = all(claim.claim != NOT_WORSE for claim in stated)
         if without and not absolute and self.verdicts.reference == "":
             raise InputError(
                 f"verdicts.claims has {NOT_WORSE.name!r}: name verdicts.reference, a policy or a "
@@ -353,7 +354,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         """How many runs or encoders each claim is tested on."""
         named = {each.name: each for each in self.observed}
         found = {}
-        for claim in self.verdicts.stated:
+        for claim in self.planned.rules.stated:
             sides = (named[claim.x], named[claim.y])
             linked = len(linked_units([[*map(each.encoder_seed, self.seeds)] for each in sides]))
             found[claim] = linked if linked >= FEWEST_UNITS else len(self.seeds)

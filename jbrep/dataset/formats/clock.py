@@ -31,8 +31,8 @@ def in_parts(rows: Rows, layout: Layout, leaves: Sequence[Leaf], counts: Counts)
 
     Leaves are those of observation, action and reward, in this order.
     """
-    is_uneven = layout.rate is not None
-    for part in _resampled(rows, layout, leaves, counts) if is_uneven else _once_each(rows, counts):
+    resamples = layout.rate is not None
+    for part in _resampled(rows, layout, leaves, counts) if resamples else _once_each(rows, counts):
         steps = len(part["action"])
         length = layout.length or steps
         counts["cut", f"after {length} rows"] += (steps - 1) // length
@@ -45,10 +45,8 @@ def _once_each(rows: Rows, counts: Counts) -> Iterator[Rows]:
     """The rows without those that have the time of the one before; how it ends is kept."""
     again = np.diff(rows.get("time", np.arange(len(rows["action"]))), prepend=-np.inf) == 0
     counts["row", "at the time of the row before: left out"] += int(again.sum())
-    once = {name: values[~again] for name, values in rows.items()}
-    for name in {*ENDS, "next_observation"} & rows.keys():
-        once[name][-1] = rows[name][-1]
-    yield once
+    is_last, after = np.append(~again[1:], True), {*ENDS, "next_observation"}
+    yield {name: values[is_last if name in after else ~again] for name, values in rows.items()}
 
 
 def _resampled(

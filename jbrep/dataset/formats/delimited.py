@@ -105,6 +105,8 @@ def _head(path: Path) -> tuple[int, str, list[str]]:
 def _decimal(path: Path, separator: str, cells: list[str]) -> str:
     """The decimal mark; only between semicolons a comma is surely one, and no mark of thousands."""
     commas = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)]
+    if sum("." in cell and _type(cell) == pa.float64() for cell in cells) > len(commas):
+        return "."  # commas are in some text
     if separator != ";" and commas and all(map(_THOUSANDS.fullmatch, commas)):
         raise InputError(
             f"{path} has numbers such as {commas[0]}, of which it can't be told whether the comma "

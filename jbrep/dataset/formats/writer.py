@@ -3,6 +3,7 @@
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -75,7 +76,8 @@ def from_arrays(
     columns = {"observation": observations, "action": actions, "reward": rewards}
     columns |= {"terminated": terminations, "truncated": truncations}
     once = {"final_observation": final_observations, "seed": seeds}
-    return _written(folder, Source(frame_in_python(columns, once, source)), task)
+    frame = frame_in_python(columns, once, source)
+    return _written(folder, lambda missing: Source(frame, None, missing), task)
 
 
 def from_table(
@@ -97,7 +99,7 @@ def from_table(
         task: that the rows are of, or its name; made from the data alone if not given.
         source: where they come from, a few words; also the id of a task made from the data.
     """
-    opened = Source(frame_of_table(table, source), layout, missing)
+    opened = partial(Source, frame_of_table(table, source), layout)
     return _written(folder, opened, task, layout, missing)
 
 
@@ -119,19 +121,21 @@ def from_file(
         missing: likewise.
         task: likewise; by default the one that the files name, if they do.
     """
-    opened = open_sources([*map(str, (file, *more))], layout, missing)
+    opened = partial(open_sources, [*map(str, (file, *more))], layout)
     return _written(folder, opened, task, layout, missing)
 
 
 def _written(
     folder: str | Path,
-    source: Source,
+    opened: Callable[[str], Source],
     task: Task | str | None,
     layout: Layout | None = None,
     missing: str = "",
 ) -> Dataset:
     reward = layout.reward if layout and is_code(layout.reward) else ""
     known = None if task is None else as_task(task)
+    missing = missing or (known.missing if known else "") or ""
+    source = opened(missing)
     write(source, Path(folder), known, missing=missing, reward=reward)
     if lost := source.changes()[LAST]:
         warnings.warn(f"{counted(lost, LAST[0])} {LAST[1]}", Notice, 3)
@@ -154,10 +158,10 @@ def write(
         task: that they are of; by default the one that the source names, or else one that is made
             from the data alone.
         features: a TOML file of what else is known of the features, as `describe` takes it.
-        missing: as `without_missing` takes it; by default as the task says.
+        missing: as `without_missing` takes it.
         reward: code, see `reward_function`, in place of the source's rewards.
     """
-    missing = converted(missing, Missing, "missing") if missing else (task and task.missing) or ""
+    missing = converted(missing, Missing, "missing") if missing else ""
     if task:
         _check_alike(source, task)
     make_folder(folder.parent)
