@@ -21,6 +21,7 @@ from jbrep.errors import Notice
 from jbrep.text import noted
 
 ATTEMPTS = 5  # at a job whose process is killed
+KILLED = f"was killed {ATTEMPTS} times, perhaps because memory ran out: try fewer"
 _ANSWERS_WITHIN = 10.0  # seconds, a cluster
 _CLOSED_WITHIN = 60.0  # seconds, what a process has open
 _SINGLE_THREADED = dict.fromkeys(

@@ -12,7 +12,7 @@ from jbrep.studies.runner import usual_workers
 def main(file: Path, folder: Path) -> None:
     plan = Plan(read_study(file), folder, file)
     check(plan)
-    plan.begin()
+    plan.write()
     with exclusive(plan.folder):
         prepare(plan, usual_workers(plan))
 

@@ -85,7 +85,7 @@ def cells(known: pd.DataFrame, bounds: Bounds) -> Iterator[tuple[str, str, str]]
     assert blind
     for name in sorted(finals, key=lambda name: (name != BASELINE, name)):
         x, y = finals[[name, BASELINE]].dropna().to_numpy(float).T  # of the seeds of both
-        share = interval(share_of_gain(x, y, by_policy[blind], LEVEL).tolist(), ".2f")
+        share = interval(share_of_gain(x, y, by_policy[blind]).tolist(), ".2f")
         own = finals[name].dropna().to_numpy(float)
         mean = interval(mean_within(own, bounds, LEVEL).tolist(), ".0f")
         yield name, mean, "" if name == BASELINE else share

@@ -17,7 +17,7 @@ from jbrep.envs.names import Known
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, first_line, refusing
 from jbrep.machine import cores
-from jbrep.pool import ATTEMPTS, side_by_side, stop_requested
+from jbrep.pool import KILLED, side_by_side, stop_requested
 
 _PIECES = 10  # of a shard: what a worker makes at a time
 _AHEAD = 4  # pieces for each worker, begun or held until those before are made
@@ -74,10 +74,8 @@ def _in_processes(simulator: Simulator, workers: int, known: Known) -> Produce:
         ):
             for piece, result in pieces:
                 if result is None:
-                    raise InputError(
-                        f"the worker that began with episode {piece.start} was killed "
-                        f"{ATTEMPTS} times, perhaps because memory ran out: try fewer `threads`"
-                    )
+                    begun = f"the worker that began with episode {piece.start}"
+                    raise InputError(f"{begun} {KILLED} `threads`")
                 made[piece] = result
                 while waiting and waiting[0] in made:
                     yield from _whole(made.pop(waiting.popleft()))

@@ -2,11 +2,9 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from msgspec import UNSET
-from numpy.typing import NDArray
 
 from jbrep.collecting.collector import write_shards
 from jbrep.collecting.shards import Growth, Produce
@@ -19,8 +17,6 @@ from jbrep.envs.recording import Tick
 from jbrep.envs.task import Task
 from jbrep.envs.view import seen_in_episodes, with_view
 from jbrep.errors import InputError, differences
-
-Array = NDArray[Any]
 
 
 def derive(

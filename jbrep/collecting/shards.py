@@ -4,12 +4,11 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jbrep.collecting.policies import Policy
+from jbrep.dataset.columns import Array
 from jbrep.dataset.manifest import Manifest, commit, open_shard
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined, some_episodes
 from jbrep.dataset.settings import SHARD_ROWS
@@ -19,8 +18,6 @@ from jbrep.envs.recording import Recording, Tick, read_nothing, read_states, rec
 from jbrep.errors import InputError
 
 NUM_ENVS = 100  # of a batch
-
-Array = NDArray[Any]
 
 
 class Growth:

@@ -24,7 +24,7 @@ from jbrep.progress import Progress
 from jbrep.records.commit import Commits, commits
 from jbrep.records.document import Document, document_from, parse_json
 from jbrep.records.record import Record, Sha256, Version
-from jbrep.records.storage import exists, write_whole
+from jbrep.records.storage import exists, read_file, write_whole
 
 MANIFEST = "manifest.json"
 AGAIN = "collect or import the data again in another folder"
@@ -81,10 +81,10 @@ class Manifest(Document, frozen=True, kw_only=True):
         """Whether there are as many rows as the settings ask for."""
         return self.rows >= self.settings.steps
 
-    def text(self) -> str:
-        """The text of its file, with a hash of all that it says."""
-        plain = self.as_json()
-        return json.dumps({**plain, _HASH: _digest(plain)}, indent=self.indent) + "\n"
+    def as_json(self) -> dict[str, Any]:
+        """What its file has, with a hash of all that it says."""
+        plain = super().as_json()
+        return {**plain, _HASH: _digest(plain)}
 
     def attributes(self, shard: int, rows: int) -> dict[str, Any]:
         """The HDF5 attributes of a shard's file."""
@@ -134,13 +134,11 @@ def read_manifest(folder: Path) -> Manifest:
             f"no data set in {folder}: expected a folder with {MANIFEST}, as jbrep collect and "
             "jbrep data import write it"
         )
-    with refusing(f"can't read {path}", (OSError,)):
-        raw = path.read_bytes()
-    given = parse_json(raw, path, Manifest.format)
+    given = parse_json(read_file(path), path, Manifest.format)
     stated = given.pop(_HASH, None)
     manifest = document_from(given, path, Manifest)
     if stated != _digest(given):
-        raise DamageError(f"{path} is damaged: collect again in another folder")
+        raise DamageError(f"{path} is damaged: {AGAIN}")
     return manifest
 
 

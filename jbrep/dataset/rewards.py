@@ -1,16 +1,14 @@
 """Rewards of a user's own for data that exist already, by a function."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.dataset.columns import Array
 from jbrep.envs.names import code_named
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, refusing
-
-Array = NDArray[Any]
 
 
 def reward_function(code: str) -> Callable[[Array, Array], NDArray[np.float64]]:

@@ -16,7 +16,7 @@ from jbrep.errors import InputError, matching
 Rows = NDArray[np.int64]
 Features = Sequence[Feature]
 Parts = Callable[[Rows], Iterable[NDArray[Any]]]  # numbers of rows, in parts (n, m)
-Range = tuple[NDArray[Any], NDArray[Any]]  # what becomes -1 and 1, (d,) each
+Range = tuple[NDArray[Any], NDArray[Any]]  # such as what becomes -1 and 1, (d,) each
 
 EXTREMA = "extrema"  # the paper's
 NOMINAL = "nominal"

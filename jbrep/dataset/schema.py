@@ -141,7 +141,7 @@ class DataSettings(Record, frozen=True, kw_only=True):
         return {n: spec for n, spec in self.specs().items() if not n.startswith(EPISODES)}
 
     def columns(self, known: Columns) -> Columns:
-        """All columns of some episodes, in order, from those that follow from no others."""
+        """All columns of some episodes, in order, given those that others don't imply."""
         return {
             name: np.asarray(spec.follows(known) if spec.follows else known[name], spec.dtype)
             for name, spec in self.specs().items()

@@ -9,7 +9,7 @@ import numpy as np
 from jbrep.envs.task import Array, Task
 from jbrep.jitterbug.tasks import jitterbug_task
 from jbrep.play.sources import find_player
-from jbrep.records.tables import rounded as as_in_tables
+from jbrep.records.tables import as_in_tables
 from jbrep.stats.intervals import LEVEL, Bounds, mean_within
 from jbrep.stats.labels import NO, UNCLEAR, YES, learnt
 from jbrep.stats.scale import CONSTANT, LOOKING, RANDOM, STILL, best_blind

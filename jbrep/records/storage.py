@@ -59,16 +59,15 @@ def write_new(path: Path, content: bytes) -> None:
     """Write a file that doesn't exist yet, as `write_whole`."""
     with unfinished(path) as partial:
         write_whole(partial, content)
-        partial.replace(path)
-        sync(path.parent)
+        publish(partial, path)
 
 
 @contextmanager
 def exclusive(path: Path, *, beside: bool = False, wait: float = 0) -> Iterator[None]:
     """Be the only writer in a folder, which has a file `.lock` until the process ends or lets go.
 
-    With `beside`, the lock stands beside the path, which may not exist yet. For another process it
-    waits so many seconds at most.
+    With `beside`, the lock stands beside the path, which may not exist yet. Another process is
+    waited for, up to `wait` seconds.
     """
     if beside and not path.name:
         raise InputError(f"{path} can't be a new file or folder: give it a name")

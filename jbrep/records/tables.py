@@ -75,7 +75,7 @@ def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -
     return write_csv(path, [*map(_column, kind._fields)], ([*map(_cell, row)] for row in rows))
 
 
-def read_rows(path: Path, kind: type[_Row], sha256: str | None = None) -> list[_Row]:
+def read_rows(path: Path, kind: type[_Row], sha256: str) -> list[_Row]:
     """What `write_rows` wrote."""
     cells: dict[type, Callable[[str], Any]] = {str: str, int: count, float: finite}
     columns = {_column(name): cells[of] for name, of in kind.__annotations__.items()}
@@ -88,7 +88,7 @@ def _cell(value: str | float) -> str | int:
     return value if isinstance(value, str) else int(value)
 
 
-def rounded(value: float) -> float:
+def as_in_tables(value: float) -> float:
     """A number as tables have it: three decimals, or six digits of one below 1."""
     return float(_cell(float(value)))
 

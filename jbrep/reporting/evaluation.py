@@ -6,7 +6,7 @@ from typing import NamedTuple
 from jbrep.encoders import FULL
 from jbrep.evaluation.diagnosis import SCALARS
 from jbrep.evaluation.evaluation import Diagnostics, Evaluation, Lost, Score
-from jbrep.reporting.views import say
+from jbrep.reporting.views import ADVICE, say
 from jbrep.text import Table, facts, number, r2_text, wrapped
 
 _MEASURES = {  # the first that the full observation predicts decides
@@ -17,7 +17,6 @@ _MEASURES = {  # the first that the full observation predicts decides
 _PREDICTED = 0.1  # least R² that counts as predicted
 AS_GOOD = 0.9  # share of the best R² that is enough
 _MANY = 8  # features that are named
-_CHOSEN_BY = "rewarded"  # whose interval is shown
 
 
 class Advice(NamedTuple):
@@ -66,8 +65,7 @@ def judge(evaluation: Evaluation) -> Advice:
     misses, threshold = missed(evaluation), AS_GOOD * max(r2.values())
     ranked = sorted((label for label in r2 if label != FULL), key=lambda label: -r2[label])
     enough = [label for label in ranked if r2[label] >= threshold]
-    predictive = [label for label in ranked if r2[label] >= _PREDICTED]
-    nearest = next(iter(predictive), None)
+    nearest = next((label for label in ranked if r2[label] >= _PREDICTED), None)
     complete = [label for label in enough if not misses[label]]
     size = {label: evaluation.encoders[label].latent for label in enough}
     return Advice(by, enough, min(complete or enough, key=size.__getitem__, default=None), nearest)
@@ -96,7 +94,7 @@ def _score(known: Diagnostics, name: str) -> Score:
 def _r2(known: Diagnostics, name: str) -> str:
     """An R² of the headline; that by which codes are chosen with its interval."""
     value, low, high = _score(known, name)
-    is_chosen_by = name == _CHOSEN_BY and low is not None
+    is_chosen_by = name == ADVICE and low is not None
     return r2_text(value) + (f" [{r2_text(low)}, {r2_text(high)}]" if is_chosen_by else "")
 
 

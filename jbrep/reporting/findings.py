@@ -73,7 +73,7 @@ class Group(Record, frozen=True, kw_only=True):
     blind: Score
     best_policy: str | None  # of the blind baselines
     references: Numbers
-    in_training: dict[str, float]  # the same, where the starts of all evaluations are those
+    in_training: dict[str, float]  # the same, if all evaluations have the same starts; else empty
     thresholds: dict[str, float | None]
     profile_returns: list[float]
     agents: list[Agents]  # the baseline first
@@ -224,7 +224,7 @@ class Findings(Document, frozen=True, kw_only=True):
             algorithms=[*dict.fromkeys(each.learner for each in settings)],
             representations=seen,
             own_encoders=in_order(own, FULL),
-            baseline=analysis.baseline if analysis else record.baseline,
+            baseline=record.baseline,
             top=top if isinstance(top, str) else "",
             is_study=record.study is not None,
             registration=record.registration,
@@ -253,10 +253,9 @@ class Findings(Document, frozen=True, kw_only=True):
         """Runs that failed."""
         return [run for run in self.runs if run.status == FAILED]
 
-    def verdicts_of(self, group: Group) -> list[Verdict]:
+    def verdicts_of(self, task: str, algorithm: str) -> list[Verdict]:
         """On the claims of one task and algorithm."""
-        key = group.task, group.algorithm
-        return [each for each in self.verdicts if (each.task, each.algorithm) == key]
+        return [v for v in self.verdicts if (v.task, v.algorithm) == (task, algorithm)]
 
 
 def groups_of(
@@ -279,7 +278,6 @@ def _group(
     group: GroupAnalysis, shared: Mapping[str, Mapping[str, list[float]]], played: dict[str, float]
 ) -> Group:
     plain, agents = to_plain(group), []
-    del plain["verdicts"]
     for label, of_label in zip(group.labels, plain.pop("labels"), strict=True):
         own = shared.get(f"{group.task}/{group.algorithm}/{label.representation}", {})
         means = {

@@ -21,7 +21,7 @@ _LEAST_LACKING = 1e-12  # of 1, in a level: floating-point numbers tell no more 
 # what would be read as markup: an underscore within a word and a bracket without a link are not
 _WITHIN_A_LINE = r"[\\`*<|~#]|&(?=[#\w])|(?<!\w)_|_(?!\w)|!(?=\[)|\](?=[(\[:])"
 _UNKNOWN = Score(None)
-_ADVICE = "rewarded"  # the diagnostic by which encoders are recommended
+ADVICE = "rewarded"  # the diagnostic by which encoders are recommended
 _NAME: Cells = {"representation": lambda each: each.representation}
 
 
@@ -112,7 +112,7 @@ def _returns_table(name: str, groups: Sequence[Group], found: Findings, brief: b
     advised = {
         name: value
         for each in found.diagnostics
-        if (each.task, each.algorithm, each.diagnostic) == (first.task, first.algorithm, _ADVICE)
+        if (each.task, each.algorithm, each.diagnostic) == (first.task, first.algorithm, ADVICE)
         for name, value in zip(each.representations, each.values, strict=True)
     }
     shares = dict.fromkeys(share for g in groups for each in g.agents for share in each.shares)
@@ -122,7 +122,7 @@ def _returns_table(name: str, groups: Sequence[Group], found: Findings, brief: b
         "above baselines": lambda each: f"{each.learnt}{', rising' if each.rises else ''}",
         "score": _number("score", ".2f"),
         **(
-            {f"predicted ({_ADVICE})": lambda each: r2_text(advised.get(each.representation))}
+            {f"predicted ({ADVICE})": lambda each: r2_text(advised.get(each.representation))}
             if advised
             else {}
         ),
@@ -153,8 +153,7 @@ def verdict_tables(found: Findings, brief: bool = False) -> list[Table]:
     """What was registered: a table for each task and algorithm."""
     tables = []
     for task, algorithm in dict.fromkeys((v.task, v.algorithm) for v in found.verdicts):
-        own = [v for v in found.verdicts if (v.task, v.algorithm) == (task, algorithm)]
-        rows = [verdict_cells(verdict) for verdict in own]
+        rows = [verdict_cells(verdict) for verdict in found.verdicts_of(task, algorithm)]
         if brief:
             rows = [{n: row[n] for n in ("claim", "verdict", "estimate", "score")} for row in rows]
         title = f"{task}, {algorithm}, registered claims"

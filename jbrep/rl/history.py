@@ -48,7 +48,7 @@ class History:
 
     def add(self, step: int, outcome: Outcome) -> None:
         """Record an evaluation after so many steps."""
-        returns: Sequence[float] = [tables.rounded(each) for each in outcome.returns]
+        returns: Sequence[float] = [tables.as_in_tables(each) for each in outcome.returns]
         self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(returns)]
         numbered = enumerate(outcome.numbers)
         self.infos += [Info(step, i, *each) for i, numbers in numbered for each in numbers.items()]

@@ -85,7 +85,6 @@ class GroupAnalysis:
     labels: tuple[RepresentationResult, ...]  # results of each representation, the baseline first
     # of the other representations with the baseline, in the same order
     comparisons: tuple[Comparison, ...]
-    verdicts: tuple[Verdict, ...]  # on the claims that were registered
 
     @property
     def best_policy(self) -> str | None:
@@ -97,15 +96,9 @@ class GroupAnalysis:
 class Analysis:
     """The results of a study."""
 
-    planned: Planned  # what reached the verdicts
     groups: tuple[GroupAnalysis, ...]  # by task and algorithm
     verdicts: tuple[Verdict, ...]  # on all claims that were registered, by task and algorithm
     aggregates: tuple[Aggregate, ...]  # results across tasks that have scores, of each algorithm
-
-    @property
-    def baseline(self) -> str:
-        """The representation that the others are compared with."""
-        return self.planned.rules.baseline
 
 
 def analyse(
@@ -118,26 +111,17 @@ def analyse(
     """
     planned = planned or Planned()
     by_group, played = groups(runs, planned.rules.baseline), references or {}
-    verdicts = planned(by_group)
     analysed = tuple(
-        _analyse_group(
-            group,
-            tuple(each for each in verdicts if (each.task, each.algorithm) == key),
-            played.get(key[0], {}),
-        )
-        for key, group in by_group.items()
+        _analyse_group(group, played.get(key[0], {})) for key, group in by_group.items()
     )
     return Analysis(
-        planned=planned,
         groups=analysed,
-        verdicts=tuple(verdicts),
+        verdicts=tuple(planned(by_group)),
         aggregates=tuple(aggregates(_scores(analysed))),
     )
 
 
-def _analyse_group(
-    group: Group, verdicts: tuple[Verdict, ...], references: Mapping[str, Sequence[float]]
-) -> GroupAnalysis:
+def _analyse_group(group: Group, references: Mapping[str, Sequence[float]]) -> GroupAnalysis:
     first, known, starts = evaluated_run(group), compared(group), None
     if len(first.steps):
         ends = [r.final for runs in group.values() for r in runs if r.final is not None]
@@ -161,7 +145,6 @@ def _analyse_group(
         references=played,
         labels=(baseline, *others),
         comparisons=tuple(compare(each, baseline, known) for each in others),
-        verdicts=verdicts,
         **scale._asdict(),
     )
 
@@ -204,7 +187,7 @@ def _differences(pair: Pair) -> dict[str, Interval]:
         mean_within(x.mean - y.mean, Bounds(), LEVEL),
         *(
             (
-                share_of_gain(x.final, y.final, pair.ends.blind, LEVEL),
+                share_of_gain(x.final, y.final, pair.ends.blind),
                 FASTER.estimate(pair, LEVEL),
                 LESS_VARIABLE.estimate(pair, LEVEL),
             )

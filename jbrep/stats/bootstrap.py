@@ -59,9 +59,9 @@ def _weights(count: int) -> Array:
 
 
 def by_episode(values: NDArray[Any], episode: NDArray[np.int64], count: int) -> Array:
-    """Sums of rows (n, ...) over the rows of each episode, (count, ...); zero of one without any.
+    """Sums of rows (n, ...) over the rows of each episode, (count, ...); zero of one without rows.
 
-    The numbers of their episodes, (n,), ascend.
+    `episode` has that of each row, (n,), in ascending order.
     """
     sums = np.zeros((count, *values.shape[1:]))
     if len(values):

@@ -23,7 +23,7 @@ from scipy.stats import norm, trim_mean
 from jbrep.stats.bootstrap import Array, Interval
 
 LEVEL = 0.95
-RESAMPLES = 2000
+_RESAMPLES = 2000
 UNDEFINED = Interval(np.nan, np.nan, np.nan)
 _FEWEST_PAIRS = 5  # or families for an interval: with fewer, ranks agree by chance too often
 FEWEST_RUNS = 4  # for an interval: three or fewer are better shown as points
@@ -44,7 +44,7 @@ def percentile(statistic: Callable[..., Array], *samples: Array) -> Interval:
     drawn = []
     for sample in samples:
         runs = sample.shape[-1]
-        drawn.append(sample[..., random.integers(0, runs, (RESAMPLES, runs))])
+        drawn.append(sample[..., random.integers(0, runs, (_RESAMPLES, runs))])
     with np.errstate(divide="ignore", invalid="ignore"):
         value, values = statistic(*samples), statistic(*drawn)
     unknown = np.isnan(values)
@@ -55,9 +55,9 @@ def percentile(statistic: Callable[..., Array], *samples: Array) -> Interval:
     return Interval(value, low, high)
 
 
-def unless_few(interval: Interval, *runs: int) -> Interval:
+def unless_few(interval: Interval, runs: int) -> Interval:
     """An interval, or its value alone where a sample has fewer runs than FEWEST_RUNS."""
-    return interval if min(runs) >= FEWEST_RUNS else UNDEFINED._replace(value=interval.value)
+    return interval if runs >= FEWEST_RUNS else UNDEFINED._replace(value=interval.value)
 
 
 def constant(values: Array) -> NDArray[np.bool_]:
@@ -153,16 +153,17 @@ def mean_within(values: Array, bounds: Bounds, level: float) -> Interval:
 
 
 def surely_above(values: Array, least: float, bounds: Bounds) -> bool:
-    """Whether a mean lies above a number: its intervals do, or each of few values (n,).
+    """Whether the mean of values (n,) is surely above a number.
 
-    Student's interval must, too: the other never ends below the least possible return.
+    Its bounded interval and Student's must lie above it, of fewer than four values each value. The
+    bounded one alone would always exclude the least possible return.
     """
     if len(values) < FEWEST_RUNS or constant(values):
         return bool(values.min() > least)
     return all(bool(mean_within(values, each, LEVEL).low > least) for each in (bounds, Bounds()))
 
 
-def share_of_gain(x: Array, y: Array, reference: float, level: float) -> Interval:
+def share_of_gain(x: Array, y: Array, reference: float) -> Interval:
     """The gain of x (n,) over a reference as a share of that of y (n,), with its interval.
 
     Units are paired. The interval has the shares c for which Student's interval of the mean of
@@ -173,7 +174,7 @@ def share_of_gain(x: Array, y: Array, reference: float, level: float) -> Interva
     of_x, of_y = gains.mean(axis=1)
     if of_y <= 0:
         return UNDEFINED
-    quantile = stdtrit(len(x) - 1, (1 + level) / 2)
+    quantile = stdtrit(len(x) - 1, (1 + LEVEL) / 2)
     (xx, xy), (_, yy) = quantile**2 * np.cov(gains) / len(x)
     a, b, c = of_y**2 - yy, of_x * of_y - xy, of_x**2 - xx
     value = float(of_x / of_y)

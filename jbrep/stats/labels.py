@@ -89,16 +89,16 @@ def describe(
 def learnt(final: Array, blind: Interval, bounds: Bounds) -> str:
     """Whether final returns lie above a mean return beyond what is uncertain of either.
 
-    It is unclear at most where that return has no upper end.
+    If the interval of that return has no upper end, they are never surely above it.
     """
     if surely_above(final, blind.value, bounds) and not final.mean() <= blind.high:
         return YES
     return UNCLEAR if final.mean() > blind.value else NO
 
 
-def profile(final_return: Array, returns: Array) -> Interval:
+def profile(final: Array, returns: Array) -> Interval:
     """A performance profile (Agarwal et al. 2021): the shares of runs (n,) above returns (k,)."""
-    above = (final_return > returns[:, None]).astype(float)
+    above = (final > returns[:, None]).astype(float)
     return percentile(lambda values: values.mean(axis=-1), above)
 
 

@@ -67,7 +67,7 @@ class Pair(NamedTuple):
 def pair_of(group: Group, x: str, y: str, seeds: Collection[int]) -> Pair | None:
     """Representations x and y of a group; None where they share fewer than two of the seeds.
 
-    What others than these and the baseline return, and with other seeds, makes no difference.
+    Runs on others than these and the baseline, or with other seeds, have no effect.
     """
     names = dict.fromkeys([*[*group][:1], *(name for name in group if name in (x, y))])
     counted = with_failure_returns([r for n in names for r in group[n] if r.seed in seeds])

@@ -167,19 +167,19 @@ class Planned:
     def __call__(self, groups: Mapping[Key, Group]) -> list[Verdict]:
         """What is found of each claim, on each planned task and algorithm."""
         chains = [
-            _Chain(key, x, y, claims, self._pair(key, groups.get(key, {}), x, y), self.share)
+            _Chain(key, x, y, claims, self._pair(key, group, x, y), self.share, self.rules.margin)
             for key in self.groups
+            for group in [groups.get(key, {})]
             for (x, y), claims in self.rules.chains.items()
         ]
         waiting = chains
-        while waiting:
-            decided = [chain for chain in waiting if chain.test(self.rules)]
-            waiting = [chain for chain in chains if not chain.is_done] if decided else []
+        while decided := [chain for chain in waiting if chain.test()]:
+            waiting = [chain for chain in chains if not chain.is_done]
             for chain in decided:
                 if chain.is_done:
                     for other in waiting:
                         other.level += chain.level / len(waiting)
-        return [verdict for chain in chains for verdict in chain.every(self.rules)]
+        return [verdict for chain in chains for verdict in chain.every()]
 
     def _pair(self, key: Key, group: Group, x: str, y: str) -> Pair | str:
         if reason := self.prevented.get(key[0]):
@@ -201,6 +201,7 @@ class _Chain:
     claims: Sequence[Claim]
     pair: Pair | str  # a reason where there is none
     level: float
+    margin: float  # of *not worse*
     decided: list[Verdict] = field(default_factory=list)
     undecided: Verdict | None = None  # of the claim that was tested last
 
@@ -210,19 +211,19 @@ class _Chain:
         contradicted = any(each.verdict == CONTRADICTED for each in self.decided)
         return contradicted or len(self.decided) == len(self.claims)
 
-    def test(self, rules: Rules) -> bool:
+    def test(self) -> bool:
         """Test the claims that are left, one after the other; whether any was decided."""
         before = len(self.decided)
         while not (self.is_done or isinstance(self.pair, str)):
             claim = self.claims[len(self.decided)]
-            verdict = _tested(self._estimated(claim, self.pair, rules), claim, self)
+            verdict = _tested(self._estimated(claim, self.pair), claim, self)
             self.undecided = verdict if verdict.verdict == UNDECIDED else None
             if self.undecided:
                 break
             self.decided.append(verdict)
         return len(self.decided) > before
 
-    def every(self, rules: Rules) -> Iterator[Verdict]:
+    def every(self) -> Iterator[Verdict]:
         """A verdict on each claim: decided, tested last, or not tested."""
         yield from self.decided
         if self.undecided:
@@ -234,16 +235,16 @@ class _Chain:
             else:
                 assert last
                 reason = f"not tested: {last.claim!r} is {last.verdict}"
-                yield replace(self._estimated(claim, self.pair, rules), reason=reason)
+                yield replace(self._estimated(claim, self.pair), reason=reason)
 
     def _about(self, claim: Claim) -> dict[str, Any]:
         task, algorithm = self.key
         of = {"task": task, "algorithm": algorithm, "x": self.x, "claim": claim.name, "y": self.y}
         return {**of, "verdict": UNDECIDED}
 
-    def _estimated(self, claim: Claim, pair: Pair, rules: Rules) -> Verdict:
+    def _estimated(self, claim: Claim, pair: Pair) -> Verdict:
         learnt = pair.y_learns or not claim.takes_learning
-        boundary = claim.boundary(pair, rules.margin)
+        boundary = claim.boundary(pair, self.margin)
         reason = None if learnt else f"agents on {self.y} aren't above the blind baselines"
         if math.isnan(boundary):
             reason = "no reference policy is known that would score 1"

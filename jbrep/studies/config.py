@@ -384,9 +384,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
 
     def toml(self) -> str:
         """The file that describes it."""
-        given = {
-            name: value for name, value in to_plain(self).items() if value not in (None, [], {})
-        }
+        given = to_plain(self)
         if learners := given.pop("learners", {}):
             given["algorithms"] = {name: learners.get(name, {}) for name in self.algorithms}
         given["env"] = given.pop("environment", {})
@@ -396,7 +394,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         if self.data:
             tables = {name: data.table for name, data in self.named_data.items()}
             given["data"] = tables.get("", tables)
-        return toml_text(given)
+        return toml_text({n: v for n, v in given.items() if v not in (None, "", [], {})})
 
     @property
     def notices(self) -> list[str]:

@@ -364,12 +364,6 @@ class Plan:
                 f"{self.folder} holds another study: {differing}; choose another `out`"
             )
 
-    def begin(self) -> None:
-        """Make the folder, and write what the study is if it is new."""
-        self.check_folder()
-        if not exists(self.folder / STUDY):
-            self.write()
-
     def write(self) -> None:
         """Make the folder, and write what the study is."""
         make_folder(self.folder)
@@ -428,6 +422,6 @@ def _differing(there: Study, study: Study) -> str:
 
 
 def read_plan(folder: Path) -> Plan | None:
-    """The study in a folder; None if there is none, but at most runs."""
+    """The study in a folder; None if there is none, even if there are runs."""
     path = folder / STUDY
     return Plan(read_document(path, Study), folder) if exists(path) else None

@@ -25,7 +25,7 @@ from jbrep.machine import cores
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method
 from jbrep.play.sources import find_good_policy, find_player, find_policy
-from jbrep.pool import ATTEMPTS, side_by_side
+from jbrep.pool import KILLED, side_by_side
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
 from jbrep.rl import Run
@@ -300,10 +300,7 @@ def _make_all(waiting: Sequence[NeededData], workers: int, known: Known) -> None
             if mistake:
                 raise InputError(mistake)
             if mistake is None:
-                raise InputError(
-                    f"the worker that makes {each} was killed {ATTEMPTS} times, perhaps because "
-                    "memory ran out: try fewer `workers`"
-                )
+                raise InputError(f"the worker that makes {each} {KILLED} `workers`")
 
 
 def _make(threads: int, known: Known, made: NeededData) -> str:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from jbrep.envs.names import Known
 from jbrep.errors import first_line
 from jbrep.machine import cores
-from jbrep.pool import ATTEMPTS, on_cluster, side_by_side, stop_requested
+from jbrep.pool import KILLED, on_cluster, side_by_side, stop_requested
 from jbrep.records.storage import exclusive, exists, make_folder, write_note
 from jbrep.rl import Session, StoppedError, train
 from jbrep.rl.files import runs_below
@@ -123,8 +123,7 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
 
 
 def _killed(name: str) -> RunOutcome:
-    reason = f"its worker was killed {ATTEMPTS} times, perhaps because memory ran out"
-    return RunOutcome(name, CRASHED, f"{reason}: try fewer `workers`")
+    return RunOutcome(name, CRASHED, f"its worker {KILLED} `workers`")
 
 
 def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[RunOutcome]:
@@ -171,7 +170,9 @@ def run_study(plan: Plan, backend: Backend = on_this_machine, workers: int | Non
     registered = find_committed(plan.file, plan.study) if plan.file else None
     make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
-        plan.begin()
+        plan.check_folder()
+        if not exists(plan.folder / STUDY):
+            plan.write()
         if registered:
             plan.register(registered)
         elif plan.study.verdicts.claims and not (plan.registration or plan.has_begun):

@@ -47,7 +47,7 @@ def found_of(analysis, runs=(), in_training=None, **changes):
     """The findings of an analysis, with nothing of how the runs were made."""
     lists = ("own_encoders", "left_out", "not_played", "diagnostics", "versions", "processors")
     about = {name: [] for name in (*lists, "encoders", "imports")}
-    about |= {"name": "x", "title": "x", "baseline": analysis.baseline, "top": "", "error": 0.05}
+    about |= {"name": "x", "title": "x", "baseline": "full", "top": "", "error": 0.05}
     about |= {"is_study": False, "registration": None, "comparisons": 0, "planned_seeds": 0}
     about |= {"scaling": None, "study": None, "missing": {}, "settings": {}}
     groups = groups_of(analysis, in_training=in_training or {})

@@ -1,7 +1,7 @@
 """Data sets in other tools' formats: exported to them, and imported from them or from logs.
 
-What reads a format is a module with `read(path)`, which returns a `Frame`; `source_of` makes
-episodes of it, and `write` a data set of these.
+What reads a format is a module with `read(path)`, which returns a `Frame`; `Source` makes episodes
+of it, and `writer.write` a data set of these.
 """
 
 from collections.abc import Sequence
@@ -29,11 +29,6 @@ _FILES = {  # which module reads files that end so
 _FOLDERS = {"meta/info.json": "lerobot", "metadata.yaml": "bags"}  # that hold such a file
 
 
-def load_format(name: str) -> ModuleType:
-    """Import what writes a format; ModuleNotFoundError tells a package that isn't installed."""
-    return import_module(choose(name, FORMATS, "format"))
-
-
 def export(dataset: "Dataset", to: str, out: Path) -> str:
     """Write a data set in another format; returns how to open it.
 
@@ -43,7 +38,7 @@ def export(dataset: "Dataset", to: str, out: Path) -> str:
         out: a new file, which ends as its format does, or a folder; for Minari a folder of Minari
             data sets, new or not.
     """
-    module = load_format(to)
+    module = import_module(choose(to, FORMATS, "format"))
     if out.name and to in _FILES and out.suffix.lower() != f".{to}":
         raise InputError(f"{out} must end in .{to}, by which jbrep data import knows the format")
     if not len(dataset):
@@ -83,7 +78,7 @@ def _states(paths: Sequence[Path]) -> list[tuple[Path, int, int]]:
 
 
 def load_reader(given: str) -> ModuleType:
-    """Import what reads a file or folder; ModuleNotFoundError as of `load_format`."""
+    """Import what reads a file or folder; ModuleNotFoundError tells what isn't installed."""
     path = Path(given)
     suffix = path.suffix.removeprefix(".").lower()
     is_file = exists(path) and not path.is_dir()

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from jbrep.dataset.columns import Array
 from jbrep.dataset.formats.frame import CHUNK, ENDS, About, Frame, check_names, label_of, own_names
 from jbrep.envs.task import MAX_FEATURES, Feature
 from jbrep.errors import InputError, refusing
-
-Array = NDArray[Any]
 
 _IMAGE_AXES = 3  # height, width, colour
 

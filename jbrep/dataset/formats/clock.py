@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.dataset.columns import Array
 from jbrep.dataset.formats.episodes import MOST_RAW, Counts, Rows, stretches, usual_step
 from jbrep.dataset.formats.frame import ENDS
 from jbrep.dataset.formats.roles import Leaf
 from jbrep.dataset.layout import Layout
 from jbrep.errors import InputError, listed
-
-Array = NDArray[Any]
 
 _SLACK = 1e-6  # of a step, by which rounding may shift a time
 _LATE = 0.1  # of a step, by which a reading of an even clock may be late and count as on time

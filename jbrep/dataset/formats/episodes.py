@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.dataset.columns import Array
 from jbrep.dataset.formats.frame import ENDS
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.schema import UNKNOWN_SEED, joined
 from jbrep.envs.task import MAX_EPISODE_STEPS, most_held
 from jbrep.errors import InputError
 
-Array = NDArray[Any]
 Rows = Mapping[str, Array]  # a row for each step, by the keys of ALIASES, and time
 Counts = Counter[tuple[str, str]]  # of what was done: what it was done to, and what
 
@@ -32,7 +32,7 @@ class Incoming(NamedTuple):
     reward: NDArray[np.float64]  # (n,), 0 where none is known
     final: NDArray[np.float64]  # (d,), after the last action
     terminated: bool
-    truncated: bool  # also where it was terminated; else it counts as truncated anyway
+    truncated: bool  # maybe beside `terminated`; without that, always
     seed: int
     missing: int = 0  # numbers in whose place are others, or at which it was divided
 

@@ -8,14 +8,12 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from jbrep.dataset.columns import Array
 from jbrep.dataset.layout import Layout
 from jbrep.envs.task import MAX_FEATURES, Feature, Task
 from jbrep.errors import InputError, listed, refusing
 from jbrep.text import slug
-
-Array = NDArray[Any]
 
 ALIASES = {  # what others call the columns; the dotted and the last ones are LeRobot's
     "observation": ("observation", "observations", "observation.state"),
@@ -48,11 +46,13 @@ class Frame:
     name: str  # for messages and provenance
     label: str  # id of a task made from the data alone
     schema: pa.Schema  # of all columns that can be used
-    batches: Callable[[list[str]], Iterator[pa.RecordBatch]]  # of some columns, at each call
+    batches: Callable[[list[str]], Iterator[pa.RecordBatch]]  # of named columns, from the start
     rows: int | None = None  # how many, if that is known
     about: Mapping[str, About] = field(default_factory=dict)  # columns
     unusable: Mapping[str, str] = field(default_factory=dict)  # other columns, and what they are
-    late: Mapping[str, str] = field(default_factory=dict)  # that came up later, and what is wrong
+    late: Mapping[str, str] = field(
+        default_factory=dict
+    )  # that began after the first rows: an error for each
     layout: Layout = field(default_factory=Layout)  # what its format says of its columns
     after: Mapping[str, str] = field(default_factory=dict)  # observed after the action, by before
     once: Mapping[str, Array] = field(default_factory=dict)  # ends and seed of each episode, (n,)

@@ -14,15 +14,13 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
+from jbrep.dataset.columns import Array
 from jbrep.dataset.formats.arrays import frame_of_arrays, is_image, joined
 from jbrep.dataset.formats.frame import About, Frame, label_of, own_names
 from jbrep.dataset.layout import Layout
 from jbrep.errors import InputError, refusing
 from jbrep.text import counted
-
-Array = NDArray[Any]
 
 _NOW, _NEXT = "obs/", "next_obs/"
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from jbrep.dataset.columns import Array
 from jbrep.dataset.formats.arrays import column_of
 from jbrep.dataset.formats.clock import same_clock, timestep_of
 from jbrep.dataset.formats.frame import PEEKED, About, Frame, check_plain, label_of, measured, width
@@ -24,8 +24,6 @@ from jbrep.dataset.scaling import extrema, mean_and_std
 from jbrep.errors import InputError
 from jbrep.progress import Progress
 from jbrep.records.storage import publish, unfinished
-
-Array = NDArray[Any]
 
 INFO = "meta/info.json"
 _VERSIONS = ("v3", "v2")

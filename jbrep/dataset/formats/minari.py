@@ -21,8 +21,8 @@ from gymnasium.spaces.utils import flatdim, flatten
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from minari.namespace import NAMESPACE_METADATA_FILENAME
-from numpy.typing import NDArray
 
+from jbrep.dataset.columns import Array
 from jbrep.dataset.formats.arrays import frame_of_steps, joined
 from jbrep.dataset.formats.frame import About, Frame, check_plain, label_of
 from jbrep.dataset.formats.hdf5 import opened
@@ -36,8 +36,6 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line, listed
 from jbrep.progress import Progress
 from jbrep.records.storage import check_space, exists, make_folder, publish, unfinished, write_whole
-
-Array = NDArray[Any]
 
 _ROOT = "MINARI_DATASETS_PATH"
 _METADATA = "metadata.json"

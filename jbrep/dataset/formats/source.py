@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from jbrep.coordinates import wrapped
+from jbrep.dataset.columns import Array
 from jbrep.dataset.formats import roles
 from jbrep.dataset.formats.clock import in_parts, same_clock, timestep_of
 from jbrep.dataset.formats.episodes import Counts, Incoming, Rows, cut, episode_of
@@ -21,8 +21,6 @@ from jbrep.dataset.layout import Layout
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line, listed, refusing
 from jbrep.text import counted
-
-Array = NDArray[Any]
 
 _SIGNALS = ("observation", "action", "reward")
 _EXACT = ("time", "episode")  # of which no digit may be lost
@@ -239,7 +237,7 @@ class Source:
         if self._layout.time and not self._layout.rate and self._clock is None:
             notes.append("the clock is uneven: --rate brings the rows to an even one")
         for leaf, turn in zip(self._roles["observation"], self._turns.found(), strict=False):
-            is_degrees = turn is not None and turn > MOST_RADIANS
+            is_degrees = turn > MOST_RADIANS
             unit, units = ("deg", DEGREES) if is_degrees else ("rad", RADIANS)
             known = leaf.is_angle or (leaf.feature and leaf.feature.is_angle)
             if turn and not known and leaf.unit in ("", *units):

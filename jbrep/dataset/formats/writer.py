@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
-from numpy.typing import NDArray
 
+from jbrep.dataset.columns import Array
 from jbrep.dataset.formats import open_sources
 from jbrep.dataset.formats.arrays import frame_in_python
 from jbrep.dataset.formats.clock import same_clock
@@ -34,7 +34,6 @@ from jbrep.records.record import converted
 from jbrep.records.storage import check_space, make_folder, publish, unfinished
 from jbrep.text import counted, printable
 
-Array = NDArray[Any]
 Rewards = Callable[[Array, Array], Array]
 
 

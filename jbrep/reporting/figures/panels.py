@@ -1,7 +1,7 @@
 """Figures: tables drawn as panels of marks in one style, safe for the colour-blind; their files."""
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -110,20 +110,14 @@ def _cell(value: Any) -> Any:
     return "" if value is None else value
 
 
-def write(plots: Iterable[Plot], folder: Path) -> list[Path]:
-    """Write each figure as PDF and PNG, and its table as CSV.
-
-    Returns:
-        The paths of the PNG files.
-    """
+def write(plots: Collection[Plot], folder: Path) -> None:
+    """Write each figure as PDF and PNG, and its table as CSV."""
     make_folder(folder)
-    plots = [*plots]
     with exclusive(folder):
         for plot in Progress(plots, unit="figure", delay=1, leave=False):
             for kind in ("pdf", "png"):
                 write_whole(folder / f"{plot.name}.{kind}", plot.picture(kind))
             write_whole(folder / f"{plot.name}.csv", plot.csv.encode())
-    return [folder / f"{plot.name}.png" for plot in plots]
 
 
 def panels(
@@ -210,10 +204,8 @@ def column(rows: Iterable[Row], name: str) -> NDArray[np.float64]:
     return np.array([row[name] for row in rows], float)
 
 
-def line(
-    x: str, y: str, low: str = "", high: str = "", bars: bool = False, final: str = "", **style: Any
-) -> Mark:
-    """A mark: a line through numbers, with a band or bars between the columns of their ends.
+def line(x: str, y: str, low: str = "", high: str = "", final: str = "", **style: Any) -> Mark:
+    """A mark: a line through numbers, with a band between the columns of their ends.
 
     With `final`, the number in that column is marked beyond the last one, beside its name.
     """
@@ -222,10 +214,6 @@ def line(
         at, value = column(rows, x), column(rows, y)
         ends = [column(rows, each) for each in (low, high) if each]
         how: Any = {"ms": 2.5, "markevery": max(1, len(at) // 8), "label": name, **look, **style}
-        if bars:
-            spread = np.nan_to_num((value - ends[0], ends[1] - value)).clip(0)
-            axes.errorbar(at, value, spread, elinewidth=0.8, capsize=1.5, **how)
-            return
         if ends:
             step: Any = "post" if "drawstyle" in style else None
             axes.fill_between(
@@ -278,9 +266,7 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def fitting(
-    values: Iterable[float], ends: Iterable[float] = (), near: Iterable[float] = ()
-) -> Limits:
+def fitting(values: Iterable[float], ends: Iterable[float], near: Iterable[float]) -> Limits:
     """Limits of an axis of returns, with room for markers; what isn't finite doesn't count.
 
     Ends of intervals are within unless they are far beyond the values, and so is what is near

@@ -145,7 +145,7 @@ def _differences(found: Findings) -> Iterator[Row]:
     for group in found.groups:
         rows: list[tuple[Any, ...]] = [
             (v.x, v.sentence, v.estimate, v.interval, v.boundary)
-            for v in found.verdicts_of(group)
+            for v in found.verdicts_of(group.task, group.algorithm)
             if CLAIMS[v.claim].is_of_returns and v.estimate.value is not None
         ]
         untested, difference = (None, None, None), "final_return_difference"
