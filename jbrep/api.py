@@ -248,6 +248,7 @@ def train_encoder(
     return _fitter(data, out, device).fit(kind, name=name, **settings).encoder
 
 
+@checked
 def train_encoders(
     data: "Dataset | str | Path",
     out: str | Path,

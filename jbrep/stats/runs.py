@@ -15,6 +15,7 @@ from jbrep.stats.intervals import Bounds
 
 LARGEST_RETURN = 1e15  # of either sign: beyond, a number has diverged
 _ROUNDING = 1e-6  # of returns, relative to the largest
+_OF_TABLES = 6e-4  # of returns from 1 on, which have three decimals there
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +66,8 @@ class RunCurve:
                 "a curve needs at least two; the episodes of one evaluation are not runs",
             )
         every, (low, high) = np.concatenate([*self.evaluations, []]), self.bounds
-        rounding = max(6e-4, _ROUNDING * np.abs(every).max(initial=0))  # tables have 3 decimals
+        largest = np.abs(every).max(initial=0)
+        rounding = max(_OF_TABLES if largest >= 1 else _ROUNDING, _ROUNDING * largest)
         if (every < low - rounding).any() or (every > high + rounding).any():
             raise self._error(
                 f"it returned {every.min():g} to {every.max():g}",

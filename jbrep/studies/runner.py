@@ -136,7 +136,8 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[RunOutc
     import ray
 
     task = on_cluster(work, workers, gpus=int(plan.device == "cuda"))
-    under_way = {task.remote(plan.assigned(cell), plan.known): cell for cell in cells}
+    known = plan.known
+    under_way = {task.remote(plan.assigned(cell), known): cell for cell in cells}
     try:
         while under_way:
             (done,), _ = ray.wait(list(under_way))
