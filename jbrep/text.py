@@ -200,11 +200,11 @@ def duration(seconds: float) -> str:
 
 
 def percentiles(returns: Iterable[float]) -> dict[str, float]:
-    """The median of returns, and their 10 and 90 %."""
+    """The median of returns, and their 10th and 90th percentile."""
     import numpy as np
 
     low, median, high = np.percentile([*returns], (10, 50, 90)).tolist()
-    return {"median": median, "percentile_10": low, "percentile_90": high}
+    return {"median": median, "p10": low, "p90": high}
 
 
 def interval_of(returns: Iterable[float]) -> str:

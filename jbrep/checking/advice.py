@@ -79,6 +79,8 @@ def advise(
         if use_file and not where:
             commands.insert(0, ["check", *_given(task, default)[1:], "--write", "features.toml"])
     else:
+        if kinds[0] != kinds[1]:
+            why += f"; first make the data anew with --features {where or 'features.toml'}"
         derive = view and not task.view  # what is derived can't be derived from again
         derived = f"{data}-seen" if derive else str(data)
         commands = [["data", "derive", str(data), *view, "--out", derived]] if derive else []

@@ -99,7 +99,8 @@ class Check(NamedTuple):
         )
         parts += [wrapped(each, width) for each in self.notes]
         command = advice.command.replace("\n", "\n    ")
-        parts.append(f"begin with {advice.representation}: {advice.why}\n    {command}")
+        begin = wrapped(f"begin with {advice.representation}: {advice.why}", width)
+        parts.append(f"{begin}\n    {command}")
         return "\n\n".join(parts)
 
     @property

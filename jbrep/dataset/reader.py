@@ -20,7 +20,7 @@ from jbrep.dataset.schema import Columns, episode_bounds, episode_columns
 from jbrep.dataset.settings import policy_text
 from jbrep.envs.card import range_text
 from jbrep.errors import DamageError, InputError
-from jbrep.text import Table, counted, facts, number
+from jbrep.text import Table, counted, facts, number, percentiles
 
 _OPEN_SHARDS = 100  # memory-mapped at a time, at most: each takes a file descriptor
 _AHEAD = 8  # shards that are checked at a time, at most
@@ -287,7 +287,5 @@ class Dataset:
 def _spread(values: Any) -> dict[str, float]:
     if not len(values):
         return {}
-    low, median, high = np.percentile(values, (10, 50, 90))
-    ends = {"min": values.min(), "max": values.max()}
-    named = {"median": median, "p10": low, "p90": high, "mean": values.mean(), **ends}
-    return {name: float(value) for name, value in named.items()}
+    others = {"mean": values.mean(), "min": values.min(), "max": values.max()}
+    return percentiles(values) | {name: float(value) for name, value in others.items()}

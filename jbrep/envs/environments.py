@@ -397,6 +397,8 @@ class Separate:
             raise _MissingError
         if not after_step or self._held[index] > most_held(self._task.missing or ""):
             fix = "`missing` says what to do, such as hold:3, or skip if it isn't in the first step"
+            if self._task.missing == "skip":
+                fix = "skip can't leave out a first step; hold:3 repeats the last readings"
             if most := most_held(self._task.missing or ""):
                 fix = f"no more than {most} steps in a row may be"
             raise EnvironmentFailedError(

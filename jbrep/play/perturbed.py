@@ -31,8 +31,8 @@ class Row(Record, frozen=True, kw_only=True):
     domain: Domain | None
     returns: Annotated[tuple[Finite, ...], Meta(min_length=1)]  # of each episode
     median: Finite
-    percentile_10: Finite
-    percentile_90: Finite
+    p10: Finite
+    p90: Finite
     # the mean return as a share of the undisturbed one, with its 95 % interval over episodes; null
     # where one of either is below 0, so that there are no shares
     share: tuple[Finite | None, Finite | None, Finite | None] | None
@@ -51,7 +51,7 @@ class PerturbationTable(Document, frozen=True, kw_only=True):
     """What a policy returns from the same starts in several domains, the first one undisturbed."""
 
     format = "jbrep perturbations"
-    format_version = 2
+    format_version = 3
 
     policy: Line
     task: Id  # its name
